@@ -34,7 +34,8 @@ def main() -> None:
     """Run the benchmark of the command line."""
     parser = CommandParser(description=__doc__)
     subparsers = parser.add_subparsers(required=True)
-    requested = COMMANDS.keys() & set(sys.argv[1:2])  # empty, such as for --help: all commands
+    # Empty if the first argument is no command, such as --help. Then all commands are added.
+    requested = COMMANDS.keys() & set(sys.argv[1:2])
     for name in sorted(requested or COMMANDS):
         module = importlib.import_module(f"benchmarks.{COMMANDS[name]}")
         text = str(module.__doc__)

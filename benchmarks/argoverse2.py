@@ -1,4 +1,4 @@
-"""Time to extract Argoverse 2 ground truth, as in results/speed.md."""
+"""Measurement of the extraction time of Argoverse 2 ground truth, for results/speed.md."""
 
 import resource
 import time
@@ -8,6 +8,7 @@ from pathlib import Path
 from mapdata.argoverse2.log import Argoverse2Log, find_logs
 from mapdata.argoverse2.map import MAP_CLASSES, Argoverse2Map
 
+# Classes that are extracted together, by the name of the set in the results.
 _SETS = {
     "divider": MAP_CLASSES[:1],
     "ped_crossing": MAP_CLASSES[1:2],
@@ -24,12 +25,12 @@ def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict
     Args:
         root: Root folder of the data set.
         split: Split of the logs.
-        stride: N, >= 1.
+        stride: Step N between the measured poses of a log, >= 1.
 
     Returns:
-        By name: milliseconds per frame for each set of classes, milliseconds per log for the
-        preparation of its map, the number of frames, and the largest resident memory of the process
-        in MB.
+        Figures by name: milliseconds per frame for each set of classes, milliseconds per log for
+        the preparation of its map, the number of frames, and the largest resident memory of the
+        process in MB.
     """
     log_dirs = find_logs(root, split)
     start = time.process_time()

@@ -46,15 +46,15 @@ def _unique_bytes() -> int:
 
 
 def _read_in_worker(file: AnnotationFile, reads: int) -> tuple[int, int, int, int]:
-    """Read random samples, in a process that has read nothing before.
+    """Read random samples and measure the memory of this process, which has read nothing before.
 
     Args:
         file: Annotation file.
         reads: Number of samples to read.
 
     Returns:
-        Unique memory before and after reading, and resident memory, all in bytes; and the number
-        of points read.
+        Unique memory (`_unique_bytes`) before reading, unique memory after reading, resident memory
+        after reading, all in bytes, and the number of points read.
     """
     before = _unique_bytes()
     order = np.random.default_rng(0).integers(len(file), size=reads)
@@ -73,20 +73,21 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
         reads: Number of random samples that the extra process reads.
 
     Returns:
-        By name: the processor times ``open_s``, and ``read_ms`` per sample; the unique memory of
-        the extra process after reading, ``worker_mb``, which includes the interpreter and its
-        libraries; the growth of this memory by reading, ``worker_growth_mb``; the resident memory
-        with shared pages, ``worker_rss_mb``; the size of the file, ``file_mb``; and the number of
-        ``samples``.
+        Figures by name. ``samples`` is the number of samples, and ``file_mb`` is the size of the
+        file. ``open_s`` is the processor time to open the file, and ``read_ms`` the processor time
+        to read one sample. ``worker_mb`` is the memory of the extra process after reading, without
+        pages shared with other processes; it includes the interpreter and its libraries.
+        ``worker_growth_mb`` is the growth of this memory by reading. ``worker_rss_mb`` is the
+        resident memory after reading, with shared pages.
     """
     start = time.process_time()
     file = AnnotationFile(path)
-    file.instance_counts()  # reads the number of elements of each sample, as a training does first
+    file.instance_counts()  # reads the number of elements of each sample, as training does first
     open_s = time.process_time() - start
     start = time.process_time()
     for row in np.random.default_rng(1).integers(len(file), size=1000):
         file[int(row)]
-    read_ms = time.process_time() - start  # seconds of 1000 reads: milliseconds of one
+    read_ms = time.process_time() - start  # seconds of 1000 reads = milliseconds of one read
     before, after, rss, _ = in_own_process(_read_in_worker, file, reads)
     return {
         "samples": len(file),
@@ -100,11 +101,11 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
 
 
 class PerItemGroundTruth:
-    """Ground truth that is made for each item by a walk over all records of the map.
+    """Ground truth that is computed for each item by a walk over all records of the map.
 
-    It uses the devkit, as in data loaders that make ground truth while they load, and has the
-    classes divider (0), crossing (1) and boundary (2). It is compared with ``NuScenesLocalMap``,
-    which is prepared once for each map.
+    It is computed with the devkit, as in data loaders that compute ground truth while loading. The
+    classes are divider (0), crossing (1) and boundary (2). The benchmark compares it with
+    ``NuScenesLocalMap``, which is prepared once for each map.
 
     Args:
         nusc_map: Map of the devkit.
@@ -120,7 +121,7 @@ class PerItemGroundTruth:
         self._y_range = y_range
 
     def instances(self, global_from_frame: np.ndarray) -> list[MapInstance]:
-        """Elements around a pose.
+        """Compute the elements around a pose.
 
         Args:
             global_from_frame: Pose of the frame, in metres. (4, 4)
@@ -149,7 +150,7 @@ class PerItemGroundTruth:
         segments = shapely.union_all(self._areas("road_segment", patch, to_frame=to_frame))
         lanes = shapely.union_all(self._areas("lane", patch, to_frame=to_frame))
         surface = shapely.union_all([segments, lanes])
-        # Outlines end 0.2 m inside the range, which leaves out the edge of the range itself.
+        # Outlines are cut 0.2 m inside the range, so that the edge of the range is not a boundary.
         inner = box.buffer(-0.2, join_style="mitre")
         for ring in _rings(surface):
             for piece in shapely.get_parts(shapely.line_merge(ring.intersection(inner))):
@@ -192,7 +193,7 @@ def _rings(area: shapely.Geometry) -> list[shapely.Geometry]:
 
 
 def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[np.ndarray]:
-    """Equivalent orders of each element's points, resampled by one call per point.
+    """Resample the points of each element in all equivalent orders, with one call per point.
 
     Args:
         instances: Elements.
@@ -212,8 +213,8 @@ def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[n
         points = instance.points
         if is_closed(points):
             rings = []
-            # A closed ring repeats its first point, so it has one start less than points. At most
-            # P - 1 starts are used, as in MapTR's data set.
+            # A closed ring repeats its first point, so it has one start fewer than it has points.
+            # At most P - 1 starts are used, as in MapTR's data set.
             for k in range(min(len(points), num_points) - 1):
                 ring = np.roll(points[:-1], k, axis=0)
                 rings.append(resample(np.concatenate([ring, ring[:1]])))
@@ -226,7 +227,7 @@ def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[n
 def open_maps(
     root: Path, x_range: tuple[float, float], y_range: tuple[float, float]
 ) -> tuple[dict[str, NuScenesLocalMap], dict[str, PerItemGroundTruth]]:
-    """Open all maps of a data root for both ways of making ground truth.
+    """Open all maps of a data root for both ways to compute ground truth.
 
     Args:
         root: Data root with the map expansion.
@@ -257,11 +258,11 @@ def _cpu_ms(work: Callable[[], Any]) -> float:
 
 
 def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dict[str, float]:
-    """Measure two ways of making the ground truth of a frame.
+    """Measure two ways to compute the ground truth of a frame.
 
-    One takes it from a map that is prepared once (`NuScenesLocalMap`), the other walks over all
-    records of the map for each frame (`PerItemGroundTruth`). Passes over all poses alternate
-    between the two.
+    The first one takes it from a map that is prepared once (`NuScenesLocalMap`). The second one
+    walks over all records of the map for each frame (`PerItemGroundTruth`). Passes over all poses
+    alternate between the two.
 
     Args:
         root: Data root with the map expansion.
@@ -300,9 +301,9 @@ def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dic
 def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, float]:
     """Measure the training pipeline with two sources of ground truth.
 
-    One reads it from the annotation file. The other makes it for each item by a walk over the
-    records of the map, and resamples its orders of points by one call per point, as in MapTR's data
-    set. Both pipelines have equal transforms of images, and their passes alternate.
+    The first pipeline reads it from the annotation file. The second one computes it for each item
+    by a walk over the records of the map, and resamples the orders of points with one call per
+    point, as in MapTR's data set. Both apply equal image transforms. Their passes alternate.
 
     Args:
         config: Config of a ``VectorizedMapDataset``.

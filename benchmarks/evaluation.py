@@ -25,7 +25,7 @@ from gsmap.utils.errors import WorkError
 from gsmap.utils.files import read_json
 from gsmap.utils.shipped import shipped_path
 
-Record = dict[str, Any]
+Record = dict[str, Any]  # a frame or a map element, in the form of JSON
 
 
 @dataclass(frozen=True)
@@ -73,15 +73,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def generated_frames(
     count: int, seed: int = 0, size_m: Sequence[float] = (30.0, 60.0)
 ) -> list[Record]:
-    """Random frames, similar to a validation set: lines across the range, and crossings.
+    """Generate random frames that resemble a validation set, with lines and crossings.
 
     Predictions are the ground truth with noise.
 
     Args:
         count: Number of frames.
         seed: Seed of the generator.
-        size_m: Size of the map along x and y in metres. The lengths of elements grow in proportion,
-            and their number does not.
+        size_m: Size of the map along x and y in metres. Elements are stretched with the map, but
+            their number does not depend on it.
 
     Returns:
         Frames with ``token``, ``gt`` and ``pred``.
@@ -92,7 +92,11 @@ def generated_frames(
     for number in range(count):
         truths = []
         preds = []
-        for label, max_count in ((0, 12), (1, 4), (2, 7)):  # most elements of each class
+        for label, max_count in (
+            (0, 12),
+            (1, 4),
+            (2, 7),
+        ):  # label, largest number of elements
             for _ in range(rng.integers(max_count + 1)):
                 line = _random_element(rng, label) * stretch
                 truths.append({"label": label, "pts": np.round(line, 3).tolist()})
@@ -110,7 +114,7 @@ def _random_element(rng: np.random.Generator, label: int) -> np.ndarray:
     if label == 1:
         w, h = rng.uniform(low=1.5, high=7, size=2)
         return centre + np.array([[0, 0], [w, 0], [w, h], [0, h], [0, 0]])
-    # A parabola along y, cut to the range.
+    # A parabola along y, clipped to the range.
     start = -rng.uniform(low=3, high=28)
     end = rng.uniform(low=3, high=28)
     t = np.linspace(start, end, num=20)
@@ -154,6 +158,7 @@ def write_repeated_frames(folder: Path, frames: list[Record], count: int) -> tup
     """
 
     def vectors(part: str) -> Iterator[tuple[str, list[Record]]]:
+        """Yield the token and the elements of each sample; ``part`` is ``"pred"`` or ``"gt"``."""
         for k in range(count):
             frame = frames[k % len(frames)]
             yield f"{frame['token']}_{k:05d}", list(map(_vector, frame[part]))
@@ -180,13 +185,13 @@ def _resident_mib(pid: int) -> float:
 
 
 def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, workers: int = 1) -> Run:
-    """Run the command and measure it with all of its child processes.
+    """Run ``tools/evaluate.py`` and measure it together with all of its child processes.
 
     Args:
         files: Result file and ground-truth file.
         metrics: Names of the metrics.
         grid: Range of the map.
-        workers: Number of processes of the command.
+        workers: Number of worker processes of the command.
 
     Returns:
         Time and memory.
@@ -203,7 +208,7 @@ def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, worke
     process = subprocess.Popen([*command, "--workers", str(workers)], stdout=subprocess.DEVNULL)
     peak = 0.0
     pid = 0
-    while pid == 0:
+    while pid == 0:  # `os.wait4` returns 0 as long as the process runs
         peak = max(peak, _resident_mib(process.pid))
         time.sleep(0.02)
         pid, status, usage = os.wait4(process.pid, os.WNOHANG)
@@ -244,7 +249,8 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
         grid: Range of the map.
 
     Returns:
-        Markdown table of the times without loading, and of both results.
+        Markdown table of the time per sample, without the loading of files, and of the mAP of both
+        algorithms.
     """
     from benchmarks import reference_evaluation as reference  # needs pycocotools
 
@@ -270,7 +276,8 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
         reference_mean_ap = evaluate_by_reference()
         reference_ms = (time.process_time() - start) / count * 1e3
         if name == "raster" and not reference.FILLS_AS_RELEASED:
-            # This version of OpenCV fills other pixels than the version of the published figures.
+            # The installed OpenCV fills polygons differently from the versions behind the published
+            # figures. The mAP is therefore computed without OpenCV's filling.
             reference_mean_ap = reference.raster_map(samples, raster, by_opencv=False)
         start = time.process_time()
         matches = []

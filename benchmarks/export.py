@@ -1,4 +1,4 @@
-"""Time of a frame of exported models in ONNX Runtime and in torch, with batch size 1 on the CPU."""
+"""Time per frame of exported models, in ONNX Runtime and in torch, with batch size 1 on the CPU."""
 
 import argparse
 import tempfile
@@ -71,6 +71,6 @@ def onnx_cost(path: str, args: argparse.Namespace, eight_bits: bool) -> Cost:
         file = Path(folder, "model.onnx")
         export_onnx(model.eval(), file, names, (height, width))
         if eight_bits:
-            quantize_onnx(file, file, [arrays])  # replaces the file
+            quantize_onnx(file, file, [arrays])  # overwrites the file
         inferencer = OnnxInferencer(file, num_threads=args.threads)
     return measure(partial(inferencer.run, arrays), torch.device("cpu"), repeats=args.repeats)

@@ -34,14 +34,14 @@ def run(args: argparse.Namespace) -> None:
     costs = measure_each(frame_cost, [(path, args, args.cuda_graphs) for path in args.configs])
     device = torch.device(args.device)
     _, first_cost = costs[0]
-    first = first_cost.time_s(device)
+    first_seconds = first_cost.time_s(device)
     rows = []
     for path, cost in costs:
         seconds = cost.time_s(device)
         row = [
             Path(path).stem,
             f"{seconds:.3f}",
-            f"{first / seconds:.3f}",
+            f"{first_seconds / seconds:.3f}",
             f"{cost.wall_s:.3f}",
             f"{1 / cost.wall_s:.2f}",
             f"{cost.peak_bytes / MIB:.0f}",
@@ -59,7 +59,7 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
     Args:
         path: Config file.
         args: Parsed options of ``benchmarks.model.add_arguments``.
-        cuda_graphs: Whether frames are recorded once on a GPU and replayed.
+        cuda_graphs: Whether a frame is recorded once as a CUDA graph and replayed, on a GPU.
 
     Returns:
         Time and memory of a frame.
@@ -68,7 +68,7 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
     model.eval()
     if cuda_graphs:
         return _replayed_frame_cost(model, inputs, samples=samples, args=args)
-    # For half precision, the weights of the backbone are converted on a GPU; a CPU uses autocast.
+    # Half precision on a GPU converts the weights of the backbone; on a CPU it uses autocast.
     halved = args.fp16 and args.device != "cpu"
     if halved:
         model.halve_backbone()
@@ -91,7 +91,7 @@ def _replayed_frame_cost(
         model.halve_backbone()
     device = torch.device(args.device)
     frames = FastFrames(StaticFrame(model), device)
-    # Roughly the inverse of the normalisation, from normalised images to pixel values.
+    # Approximate pixel values of the normalised images.
     images = (inputs["imgs"][0] * 50 + 120).clamp(0, 255).to(torch.uint8)
     batch = {"inputs": {"img": [images]}, "data_samples": samples[:1]}
     return measure(partial(frames, batch), device, repeats=args.repeats)

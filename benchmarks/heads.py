@@ -34,7 +34,7 @@ from gsmap.utils.parallel import ordered_map
 
 METRIC_NAMES = ("chamfer", "raster")
 WARM_UP = 100  # iterations
-# Options that the figures depend on.
+# Options that the figures (values of the metrics) depend on.
 _FIGURE_OPTIONS = (
     "config",
     "checkpoint",
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> None:
     figures: dict[tuple[str, int], dict[str, float]] = {}
     tasks: dict[tuple[str, int], Task] = {}
     for name, variant in variants.items():
-        config, *overrides = shlex.split(variant)
+        config, *overrides = shlex.split(variant)  # "CONFIG KEY=VALUE ..."
         for seed in range(args.seeds):
             path = args.out / f"{name}-{seed}.json"
             if path.exists():
@@ -195,12 +195,12 @@ def train_and_test(
     """Train one head on the stored features and test it.
 
     Args:
-        task: The head.
+        task: Config of the head, seed and result file.
         args: Parsed options of ``add_arguments``.
         features: Files of ``store_features`` by split.
 
     Returns:
-        Figures of both metrics.
+        Values of both metrics by key, such as ``chamfer/mAP``.
     """
     torch.set_num_threads(1)
     torch.manual_seed(task.seed)
@@ -250,9 +250,9 @@ def test(model: Any, data: dict[str, Any], results: Path) -> dict[str, float]:
         results: Result file to write.
 
     Returns:
-        Figures of both metrics.
+        Values of both metrics by key, such as ``chamfer/mAP``.
     """
-    # Without a logger of this level, the metric would log a table for each head.
+    # The metric logs a table at level INFO. This logger drops it.
     MMLogger.get_instance("heads", log_level="ERROR")
     model.eval()
     metric = METRICS.build({"type": "MapMetric", "eval": METRIC_NAMES, "out_file": str(results)})

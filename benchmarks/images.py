@@ -1,4 +1,4 @@
-"""Speed of the image steps of nuScenes' pipelines: processor time, and samples a second."""
+"""Speed of the image steps of nuScenes' pipelines: processor time, and samples per second."""
 
 import time
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ PIPELINES = {
 
 
 class Frames(Dataset):
-    """Data set that repeats one frame of six images, through a pipeline without ground truth.
+    """Data set that passes one frame of six images through a pipeline again and again.
 
     Args:
         files: Image files.
@@ -64,14 +64,15 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
     Args:
         folder: Folder of six JPEG files or more, such as a frame of nuScenes; the first six are
             read.
-        count: Number of samples of a measurement, >= 1. With several processes, each of them reads
-            this number of samples.
-        workers: Numbers of processes whose speed is measured, with training samples.
+        count: Number of samples of a measurement, >= 1. A measurement with worker processes reads
+            this number for each of them.
+        workers: Numbers of worker processes. The throughput of the training pipelines is measured
+            with each of them.
 
     Returns:
-        For each pipeline, the processor time of one thread in milliseconds per sample. For each
-        number of processes, the samples per second in batches of four, in pinned memory if there is
-        a GPU.
+        Measured values by name: for each pipeline, the processor time of one thread in milliseconds
+        per sample; for each training pipeline and number of processes, the samples per second, in
+        batches of four that are in pinned memory if there is a GPU.
 
     Raises:
         ValueError: If there are fewer than six images.

@@ -37,24 +37,25 @@ COLUMNS = (
     "plain backward (ms)",
     "backward (ms)",
 )
-# Largest relative error, by the norm, of a correct kernel. Sums of float32 are accurate to 1e-6,
-# and the gradient of a raster, which is a difference of large sums, to 1e-5.
+# Largest `relative_error` of a correct kernel. Sums of float32 are accurate to 1e-6, and the
+# gradient of a raster, which is a difference of large sums, to 1e-5.
 LARGEST_ERROR = 1e-4
-FEW = 8  # number of instances in the test of errors, as plain torch in float64 takes much memory
+FEW = 8  # errors are measured with this number of instances, since float64 takes much memory
 
 
 @dataclass(frozen=True)
 class Case:
-    """Kernel at one size.
+    """Kernel to measure at one size.
 
     Attributes:
         kernel: Name in ``TRITON_KERNELS``.
-        size: Size in words.
-        function: Function of the backend and the inputs.
-        inputs: Tensors. Gradients are computed for the floating-point ones.
-        instances: Whether the first dimension of the inputs counts instances.
-        differentiable: Whether there is a gradient.
-        largest_error: Relative error in the norm up to which values and gradients are correct.
+        size: Description of the size for the table.
+        function: Function to measure. Its arguments are the name of the backend and the inputs.
+        inputs: Input tensors. Gradients are computed for the floating-point ones.
+        instances: Whether the first dimension of every input is the number of instances. If so,
+            errors are measured with the first ``FEW`` instances.
+        differentiable: Whether the function has gradients.
+        largest_error: Largest `relative_error` of correct values and gradients.
     """
 
     kernel: str
@@ -132,11 +133,12 @@ def measure_case(case: Case, device: torch.device, reduced: bool) -> tuple[list[
         reduced: Whether to time a single call.
 
     Returns:
-        Cells of the table after kernel and size, and whether the errors are small enough.
+        Cells of the columns after ``kernel`` and ``size``, and whether the errors are small enough.
     """
     backends.AUTO_KERNELS = {case.kernel}  # if a function has several kernels, this one is used
     inputs = [x.to(device) for x in case.inputs]
     few = [x[:FEW] for x in inputs] if case.instances else inputs
+    # The expected results are computed in float64.
     exact = [x.double() if x.is_floating_point() else x for x in few]
     actual = results(case, "triton", few)
     expected = results(case, "reference", exact)
@@ -157,7 +159,7 @@ def measure_case(case: Case, device: torch.device, reduced: bool) -> tuple[list[
 
 
 def time_case(case: Case, backend: str, inputs: list[Tensor], reduced: bool) -> tuple[float, float]:
-    """Measure the median times of forward and backward.
+    """Measure the median times of the forward and the backward pass of a case.
 
     Args:
         case: The case.
@@ -166,7 +168,8 @@ def time_case(case: Case, backend: str, inputs: list[Tensor], reduced: bool) -> 
         reduced: Whether to time a single call.
 
     Returns:
-        Time of forward and of backward in milliseconds. The second is NaN if there is no gradient.
+        Times of the forward and the backward pass in milliseconds. The time of the backward pass is
+        NaN if the case has no gradient.
     """
     device = inputs[0].device
     forward = median_ms(lambda: case.compute(backend, inputs), device, reduced=reduced)
@@ -186,7 +189,7 @@ def time_case(case: Case, backend: str, inputs: list[Tensor], reduced: bool) -> 
 
 
 def differentiable_leaves(case: Case, inputs: list[Tensor]) -> list[Tensor]:
-    """Copies of inputs. If the case has gradients, the floating-point ones require a gradient."""
+    """Detached inputs. If the case has gradients, the floating-point ones require a gradient."""
     leaves = []
     for value in inputs:
         requires_grad = case.differentiable and value.is_floating_point()
@@ -216,7 +219,7 @@ def results(case: Case, backend: str, inputs: list[Tensor]) -> list[Tensor]:
 
 
 def relative_error(actual: Tensor, expected: Tensor) -> float:
-    """Norm of the difference relative to the expected norm; infinite if not a number."""
+    """Norm of the difference over the norm of ``expected``; infinite if the ratio is not finite."""
     error = (actual.double() - expected).norm() / expected.norm().clamp(min=1e-30)
     return float(error) if bool(error.isfinite()) else math.inf
 
@@ -230,7 +233,7 @@ def median_ms(function: Callable[[], object], device: torch.device, reduced: boo
         reduced: Whether to time a single call.
 
     Returns:
-        Milliseconds; on the CPU, of a single call.
+        Median time in milliseconds. On the CPU, or if ``reduced``, the time of a single call.
     """
     if device.type == "cuda":
         from triton.testing import do_bench
@@ -287,36 +290,40 @@ def sampling_cases(reduced: bool) -> Iterator[Case]:
 def random_locations(shape: tuple[int, ...], size: tuple[int, int]) -> Tensor:
     """Random locations on a map, none where the gradient of bilinear sampling jumps.
 
-    It jumps on the lines through the centres of pixels. Between these lines are squares with a
-    pixel centre at each corner: square i, from -1, reaches from the centre of pixel i to that of
-    pixel i + 1. Each location is inside such a square.
+    The gradient jumps at the lines through the centres of pixels. These lines divide the map into
+    squares with a pixel centre at each corner. Along each axis, square i, with i >= -1, reaches
+    from the centre of pixel i to the centre of pixel i + 1. Each location is inside of a square.
 
     Args:
         shape: Shape of the locations.
         size: Rows and columns of the map.
 
     Returns:
-        Locations (x, y), some up to half a pixel outside of the map, which is [0, 1]. (*shape, 2)
+        Locations (x, y) relative to the size of the map: [0, 1] on the map; some locations are up
+        to half a pixel outside. (*shape, 2)
     """
     rows, columns = size
     column = torch.randint(-1, columns, shape)
     row = torch.randint(-1, rows, shape)
-    within = 0.02 + 0.96 * torch.rand((*shape, 2))
+    within = 0.02 + 0.96 * torch.rand((*shape, 2))  # position inside the square, off its edges
     squares = torch.stack([column, row], dim=-1)
     # The centre of pixel i, where square i starts, is at i + 0.5.
     return (squares + within + 0.5) / torch.tensor([columns, rows])
 
 
 def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
-    """GKT as in the encoder of MapTR, and with points between pixels as in the encoder of MapQR."""
-    shape = (15, 25)
-    rows, columns = (6, 4) if reduced else (200, 100)
+    """Sampling of kernels of pixels around image positions, as in the encoders of MapTR and MapQR.
+
+    MapTR (GKT) rounds the positions to pixels, MapQR interpolates between pixels.
+    """
+    shape = (15, 25)  # rows and columns of the image features
+    rows, columns = (6, 4) if reduced else (200, 100)  # of the BEV features
     y, x = torch.meshgrid(
         torch.linspace(-30, 30, rows), torch.linspace(-15, 15, columns), indexing="ij"
     )
     camera_turns = torch.arange(6) / 6  # directions of six cameras, as parts of a full turn
     turns = torch.atan2(y, x).flatten()[None] / (2 * math.pi) - camera_turns[:, None]
-    # Distance from the middle of the image, in image widths of 70 degrees. (V, Q)
+    # Distance of each BEV cell from the middle of each image, in image widths of 70 degrees. (V, Q)
     from_middle = (turns - turns.round()) * 360 / 70
     visible = from_middle.abs() < 0.5
     depth = (x.square() + y.square()).sqrt().flatten().clamp(min=1.0)
@@ -357,7 +364,7 @@ def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
 
 
 def raster_cases(reduced: bool) -> Iterator[Case]:
-    """Rasters of all six layers of a decoder, with 15 or 60 elements in each."""
+    """Rasters of the elements of all six decoder layers, with 15 or 60 elements per layer."""
     height, width = (21, 33) if reduced else (200, 100)
     grid = BEVGrid((-15.0, 15.0), (-30.0, 30.0), height=height, width=width)
 
@@ -373,7 +380,7 @@ def raster_cases(reduced: bool) -> Iterator[Case]:
         return draw_polylines(lines, grid, backend=backend)
 
     def loss(backend: str, preds: Tensor, targets: Tensor) -> Tensor:
-        # Targets have no gradient, as in training. Where one is requested, it counts as 0.
+        # Targets have no gradient, as in training. `results` requests one and gets zeros.
         return raster_loss(preds, targets.detach(), backend=backend)
 
     counts = (2,) if reduced else (6 * 15, 6 * 60)

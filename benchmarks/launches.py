@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 class Trial:
-    """Model on the pretended GPU, with a batch of random inputs.
+    """Model on a pretended GPU, which computes on the CPU, with a batch of random inputs.
 
     Args:
         config: Config file, or a config.
@@ -90,7 +90,8 @@ class Trial:
         batch: Number of samples of a step.
 
     Attributes:
-        gpu: Counts of the last step or frame. Call ``step`` and ``frame`` in its context.
+        gpu: Pretended GPU, which counts the launches and waits of the last step or frame. ``step``
+            and ``frame`` must be called in its context.
         model: The model.
     """
 
@@ -131,7 +132,9 @@ class Trial:
 
     @torch.no_grad()
     def frame(self) -> Any:
-        """Count the launches of the prediction of one sample. The first also creates constants.
+        """Count the launches of the prediction of one sample.
+
+        The first prediction also creates constants.
 
         Returns:
             Sample with the prediction.
@@ -147,7 +150,7 @@ class Trial:
             return self.model.test_step(self._data([sample]))[0]
 
     def _data(self, samples: list[Any]) -> dict[str, Any]:
-        """Batch of the first inputs, one for each sample."""
+        """Batch of the given samples and of the first inputs, one for each sample."""
         inputs = {name: values[: len(samples)] for name, values in self.inputs.items()}
         return {"inputs": inputs, "data_samples": samples}
 

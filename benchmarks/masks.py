@@ -24,7 +24,7 @@ ERRORS_M = (0.1, 0.5, 1.0, 2.0, 3.0)  # standard deviations of the centres' erro
 SCALES_M = (0.15, 0.25, 0.5, 1.0, 1.5)  # standard deviations of the Gaussians
 LENGTHS_M = (4.0, 10.0, 60.0)  # lengths of missed lines
 RASTER_SIZES = ((128, 64), (200, 100), (256, 128))  # rows and columns of the raster
-# Name in the tables, and ``normalize`` and ``foreground_weight`` of `raster_loss`.
+# Arguments ``normalize`` and ``foreground_weight`` of `raster_loss`, by the name in the tables.
 REDUCTIONS = {
     "both": ("both", 1.0),
     "foreground, weight 5": ("foreground", 5.0),
@@ -87,7 +87,8 @@ def scale_gradients(
         seeds: Number of random errors.
 
     Returns:
-        -dL / d log sigma along and across the line, of all Gaussians together, mean over the seeds.
+        -dL / d log sigma along and across the line, summed over the Gaussians and averaged over the
+        seeds.
     """
     line = straight_line(60.0)
     errors = torch.randn(seeds, POINTS, 2, generator=torch.Generator().manual_seed(0))
@@ -104,7 +105,7 @@ def scale_gradients(
 
 
 def gradient_table(reduction: str, band_m: float, seeds: int) -> str:
-    """Measure one reduction and band at every error and scale.
+    """Table of the gradients of one reduction and band, for every error and scale.
 
     Args:
         reduction: Key of ``REDUCTIONS``.
@@ -168,11 +169,13 @@ def missed_line_table() -> str:
 
 
 def fit_crossing(filled: bool, iterations: int = 800) -> float:
-    """Fit Gaussians that start on the outline of a crossing to its mask, by the default loss.
+    """Fit Gaussians to the mask of a crossing by the default loss.
+
+    The centres of the Gaussians start on the outline of the crossing.
 
     Args:
-        filled: Whether the mask is filled, instead of a band along the outline.
-        iterations: Steps of Adam.
+        filled: Whether the mask is the filled crossing. Otherwise, it is a band along the outline.
+        iterations: Number of steps of Adam.
 
     Returns:
         IoU of the crossing with the polygon of the fitted centres.
@@ -186,7 +189,7 @@ def fit_crossing(filled: bool, iterations: int = 800) -> float:
     log_scales = torch.full((POINTS, 2), math.log(0.6)).requires_grad_()
     rotations = torch.zeros(POINTS).requires_grad_()
     optimizer = torch.optim.Adam([centres, log_scales, rotations], lr=0.02)
-    smallest_m = max(GRID.pixel_size_m) / 2
+    smallest_m = max(GRID.pixel_size_m) / 2  # smaller Gaussians would fall between pixels
     for _ in range(iterations):
         scales = log_scales.exp().clamp(min=smallest_m)
         rendered = render_gaussians(

@@ -52,7 +52,9 @@ class Cost:
 
 
 def measure(function: Callable[[], object], device: torch.device, repeats: int = 5) -> Cost:
-    """Measure the peak memory of a function once, after a warm-up call, then its shortest times.
+    """Measure the peak memory and the shortest times of a function.
+
+    After a warm-up call, one call is measured for the memory, and ``repeats`` calls for the times.
 
     Args:
         function: Function without arguments; its result is dropped.
@@ -118,15 +120,16 @@ def _peak_bytes(function: Callable[[], object], device: torch.device) -> int:
     if platform.system() != "Linux":
         raise WorkError("Peak memory on the CPU is read from /proc, which only Linux has.")
     libc = ctypes.CDLL(None)
-    # Freed tensors go back to the system. Memory that malloc kept for reuse would be counted as in
-    # use before the call.
+    # With this threshold, the memory of freed tensors goes back to the system. Otherwise, malloc
+    # would keep it for reuse, and it would count as memory in use before the call.
     libc.mallopt(M_MMAP_THRESHOLD, 64 * 1024)
     libc.malloc_trim(0)
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = _status_bytes("VmRSS")
     function()
-    # From here on, malloc keeps freed tensors for reuse again, as in a normal run. The call above
-    # has ended glibc's automatic choice of the threshold, whose upper limit is this value.
+    # From here on, malloc keeps the memory of freed tensors for reuse again, as in a normal run.
+    # The first call of `mallopt` has ended glibc's automatic choice of the threshold. 32 MiB is the
+    # largest threshold that glibc would choose.
     libc.mallopt(M_MMAP_THRESHOLD, 32 * MIB)
     return max(_status_bytes("VmHWM") - before, 0)
 

@@ -68,21 +68,21 @@ def _add_sweeps(tables: dict[str, list[dict[str, Any]]]) -> None:
     for record in tables["sample_data"]:
         if "LIDAR_TOP" not in record["filename"] or not record["is_key_frame"]:
             continue
-        before = record["prev"]
+        previous_token = record["prev"]
         for number in range(_SWEEPS_PER_SAMPLE):
             token = f"{record['token']}_s{number}"
-            sweep = dict(record, token=token, is_key_frame=False, prev=before)
+            sweep = dict(record, token=token, is_key_frame=False, prev=previous_token)
             sweep["ego_pose_token"] = f"{record['ego_pose_token']}_s{number}"
             pose = dict(poses[record["ego_pose_token"]], token=sweep["ego_pose_token"])
             tables["ego_pose"].append(pose)
             sweeps.append(sweep)
-            before = token
-        record["prev"] = before
+            previous_token = token
+        record["prev"] = previous_token
     tables["sample_data"] += sweeps
 
 
 def peak_of_conversion(root: Path, version: str, out_dir: Path) -> float:
-    """Convert a data root in this process.
+    """Convert a data root, and measure the peak memory of this process.
 
     Args:
         root: Data root.
@@ -90,7 +90,7 @@ def peak_of_conversion(root: Path, version: str, out_dir: Path) -> float:
         out_dir: Output folder.
 
     Returns:
-        Peak of this process's memory in MB.
+        Peak memory of this process in MB.
     """
     convert_nuscenes(NuScenesOptions(root, version, out_dir=out_dir))
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -102,7 +102,7 @@ def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[st
     Args:
         root: Data root to repeat.
         version: Version folder of the data root.
-        copies: Number of repetitions of the small and of the large size.
+        copies: Number of repetitions at the small and at the large size.
 
     Returns:
         Sizes, peaks in MB, growth in kB per sample, and the peak extrapolated to 34,149 samples in

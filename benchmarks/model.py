@@ -56,8 +56,9 @@ def measure_each(
 ) -> list[tuple[str, Cost]]:
     """Call a task with each tuple of arguments, one after another.
 
-    On a CPU each call has a process of its own, as memory that an earlier model leaves in the
-    allocator would count as memory of the next model. Memory of a GPU is counted by torch.
+    On a CPU each call runs in a separate process, because memory that an earlier model leaves in
+    the allocator would count as memory of the next model. On a GPU the calls run in this process,
+    because torch counts the memory of the GPU.
 
     Args:
         task: Function that can be pickled.
@@ -103,7 +104,7 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
 
 
 def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
-    """Size of the network's images for a config, padding included.
+    """Number and size of the images that a config's network takes, padding included.
 
     Args:
         path: Config file.
@@ -224,10 +225,10 @@ def advance_samples(samples: Sequence[Det3DDataSample]) -> None:
 
 
 def add_config_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> None:
-    """Make the targets that a config's head and losses need from the elements, in place.
+    """Add the targets that a config's head and losses need, made from the sample's elements.
 
     Args:
-        sample: Sample with elements as ground truth.
+        sample: Sample with elements as ground truth; changed in place.
         path: Config file.
         grid: Grid of the head.
     """
@@ -261,8 +262,8 @@ def add_auxiliary_targets(
     """Add random targets of auxiliary heads: masks of every class, and depth, in place.
 
     Args:
-        sample: The sample.
-        model: Model with the heads.
+        sample: Sample to which the targets are added.
+        model: Model with the auxiliary heads.
         shape: Number of cameras, image rows and columns.
         stride: Edge of a cell of the camera masks in image pixels.
         generator: Source of the values.

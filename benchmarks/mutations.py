@@ -36,7 +36,7 @@ LATE = "timed out"
 VERDICTS = (CAUGHT, SURVIVED, LATE)
 # Modules that are imported once, before the child processes fork.
 PRELOADED = ["gsmap", "pytest", "scipy.ndimage", "shapely", "mmdet3d.models", "mmdet3d.datasets"]
-# Replacement of each operator, and of each name of a function.
+# Replacement of each operator (`OPERATORS`) and of each function name (`NAMES`).
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
     ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Print each mutant and its verdict, then a row for each room.
+    """Print each mutant and its verdict, then a table with one row per room.
 
     Args:
         args: Parsed options of ``add_arguments``.
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
         # the last n rooms gets one mutant more, so that the sum over the rooms is `args.number`.
         num_mutants = (args.number + room_index) // len(args.rooms)
         order = rng.permutation(len(places))
-        # No module has an empty name, so the tests run on the code as it is.
+        # No module has an empty name, so these tests run on the unchanged code.
         unchanged = verdict(module="", source="", tests=tests_of(room, None), seconds=None)
         if unchanged != SURVIVED:
             raise InputError(f"the tests of {room} fail without a mutation: repair them first.")
@@ -100,12 +100,13 @@ def run(args: argparse.Namespace) -> None:
 
 
 def modules_of(room: str) -> dict[str, Path]:
-    """Files of the modules of a room that at least one test file of the room imports.
+    """Find the modules of a room that at least one test file of the room imports.
 
-    Modules with code for numba or Triton are left out, as these compile the unchanged file.
+    Modules with code for numba or Triton are left out, because these compilers read the file on
+    disk, which is unchanged.
 
     Returns:
-        Path by name of the module.
+        Path of each module, by the name of the module.
     """
     modules = {}
     for folder in FOLDERS:
@@ -121,11 +122,11 @@ def modules_of(room: str) -> dict[str, Path]:
 
 
 def tests_of(room: str, module: str | None) -> list[str]:
-    """Test files of a room.
+    """Find the test files of a room.
 
     Args:
         room: One of ``ROOMS``.
-        module: Name of a module that the files import; None for all files.
+        module: Only test files that import this module are returned; None for all files.
 
     Returns:
         Paths in alphabetical order.
@@ -137,7 +138,7 @@ def tests_of(room: str, module: str | None) -> list[str]:
 
 
 def _imported_names(source: str) -> Iterator[str]:
-    """Names in the ``from`` imports of a file: of the modules, and ``MODULE.MEMBER``."""
+    """Yield ``MODULE`` and each ``MODULE.MEMBER`` of the ``from`` imports of a file."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
@@ -169,10 +170,12 @@ def mutant(source: str, index: int) -> tuple[int, str, str]:
 
 
 def _places(tree: ast.AST) -> Iterator[tuple[ast.expr, dict[str, object]]]:
-    """Possible changes of a module outside of types, decorators and texts of errors.
+    """Find the possible changes of a module.
+
+    Type annotations, decorators, ``raise`` statements and f-strings are not changed.
 
     Yields:
-        An expression, and the fields that the change sets in it.
+        An expression, and the new value of each of its fields that the change sets.
     """
     skipped_nodes: set[ast.AST] = set()
     for node in ast.walk(tree):
@@ -189,7 +192,7 @@ def _places(tree: ast.AST) -> Iterator[tuple[ast.expr, dict[str, object]]]:
 
 
 def _changes(node: ast.expr) -> list[dict[str, object]]:
-    """Changes of an expression, each as the fields that it sets."""
+    """List the possible changes of an expression, each as new values of fields by name."""
     match node:
         case ast.Compare(ops=ops):
             changes: list[dict[str, object]] = []
@@ -200,7 +203,8 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
         case ast.BinOp(op=op) | ast.BoolOp(op=op) if type(op) in OPERATORS:
             return [{"op": OPERATORS[type(op)]()}]
         case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub() as op, operand=operand):
-            return [{"operand": ast.UnaryOp(op, operand)}]  # applied twice, as if removed
+            # The operator is applied twice, which has the effect of removing it.
+            return [{"operand": ast.UnaryOp(op, operand)}]
         case ast.Constant(value=bool(value)):
             return [{"value": not value}]
         case ast.Constant(value=int(value) | float(value)):
@@ -213,7 +217,7 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
 
 
 def verdict_of_room(room: str, module: str, source: str, seconds: float) -> str:
-    """Run the tests that import a module on a mutant and, if they pass, the others of the room.
+    """Test a mutant with the tests that import its module and, if they pass, with the others.
 
     Args:
         room: One of ``ROOMS``.
@@ -235,7 +239,7 @@ def verdict_of_room(room: str, module: str, source: str, seconds: float) -> str:
 
 
 def verdict(module: str, source: str, tests: Sequence[str], seconds: float | None) -> str:
-    """Run tests on a module with another source.
+    """Run tests in a child process in which one module has another source.
 
     Args:
         module: Name of the module.
@@ -251,7 +255,7 @@ def verdict(module: str, source: str, tests: Sequence[str], seconds: float | Non
     child = context.Process(target=_run_tests, args=(module, source, tests))
     child.start()
     child.join(seconds)
-    if child.exitcode is None:
+    if child.exitcode is None:  # the child still runs after the time limit
         with suppress(ProcessLookupError):  # the child has no process group yet
             # The child was started, so `pid` is not None; `or 0` is only for the type checker.
             os.killpg(child.pid or 0, signal.SIGKILL)
@@ -290,11 +294,11 @@ class _Finder:
     def find_spec(
         self, name: str, path: Sequence[str] | None, _: object = None
     ) -> ModuleSpec | None:
-        """Find the module, with a loader of the mutant; None for all other modules.
+        """Return the module's import spec with a loader of the mutant; None for other modules.
 
         Args:
             name: Name of a module.
-            path: Search path of its package.
+            path: Search path of the module's package; None for a top-level module.
         """
         spec = PathFinder.find_spec(name, path) if name == self.module else None
         if spec is not None and spec.origin is not None:

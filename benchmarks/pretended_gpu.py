@@ -1,14 +1,14 @@
-"""Pretended GPU: tensors compute on the CPU, while the launches and waits of a GPU are counted.
+"""Pretended GPU: a device that computes on the CPU and counts the launches and waits of a GPU.
 
 ``with PretendedGPU() as gpu: model.to(DEVICE); ...`` computes real values, so code that depends on
-values runs. Two mistakes that fail on a GPU raise the GPU's error: an operation on tensors of two
+values runs. Two mistakes raise the errors that they raise on a GPU: an operation on tensors of two
 devices, and the conversion of a tensor on the GPU to numpy. A launch is the start of a kernel or
-of a copy; views and allocations need no launch. A wait is a time at which the host waits for the
-GPU: to read a value, for a size that depends on values, or for an upload from memory that is not
-pinned. Each wait is counted with the line of the project that caused it.
+of a copy; views and allocations need no launch. A wait is an event at which the host waits for the
+GPU: it reads a value, needs a size that depends on values, or uploads memory that is not pinned.
+Each wait is counted with the line of the project that caused it.
 
 The device needs torch's support for backends in Python, which torch calls experimental (see
-`available`). Attention that torch fuses on a GPU is one launch here, and this project's Triton
+`available`). Attention that torch fuses on a GPU counts as one launch, and this project's Triton
 kernels are computed by their counterparts for the CPU.
 """
 
@@ -97,7 +97,7 @@ class PretendedTensor(Tensor):
         return f"PretendedTensor({self.host})"
 
     def numpy(self, *args: Any, **kwargs: Any) -> Any:
-        """Raise the error of a tensor on a GPU."""
+        """Raise TypeError, as for a tensor on a real GPU."""
         raise TypeError(f"can't convert a tensor on {DEVICE} to numpy: use Tensor.cpu() first.")
 
     def __array__(self, *args: Any, **kwargs: Any) -> Any:
@@ -116,7 +116,7 @@ class PretendedTensor(Tensor):
         return self.host.data_ptr()
 
     def tolist(self) -> Any:
-        """Values as nested lists, for which the host waits."""
+        """Values as nested lists. The host waits for them."""
         return self.cpu().tolist()
 
     @classmethod
@@ -134,9 +134,9 @@ class PretendedGPU(TorchDispatchMode):
     """Context in which the device can be used, with counts of its work.
 
     Attributes:
-        launches: Number of kernels and copies, by part (a section that the caller names with
-            `part`) and operation.
-        waits: Number of waits of the host, by part, reason and line.
+        launches: Number of kernels and copies, by part and operation. A part is a section of the
+            work that the caller names with `part`.
+        waits: Number of waits of the host, by part, reason and line of code.
     """
 
     current: "PretendedGPU | None" = None
@@ -146,8 +146,7 @@ class PretendedGPU(TorchDispatchMode):
         self.launches: Counter[tuple[str, str]] = Counter()
         self.waits: Counter[tuple[str, str, str]] = Counter()
         self._part = ""
-        # Starts of parts. Each has the number of the first autograd node of the part, and the name
-        # of the part.
+        # Start of each part: the number of its first autograd node, and the name of the part.
         self._marks: list[tuple[int, str]] = []
         self._in_backward = False
         self._undo = contextlib.ExitStack()
@@ -195,8 +194,8 @@ class PretendedGPU(TorchDispatchMode):
     def part(self, name: str) -> Iterator[None]:
         """Count the work inside the context for a part.
 
-        When the gradients of this work are computed later, inside of `backward`, they count for
-        ``backward: NAME``.
+        The gradients of this work are computed later, inside of `backward`. That work is counted
+        for the part ``backward: NAME``.
 
         Args:
             name: Name of the part.
@@ -298,7 +297,7 @@ class PretendedGPU(TorchDispatchMode):
         return return_and_correct_aliasing(func, args, kwargs=kwargs, out=result)
 
     def _convert(self, source: Tensor, kwargs: dict[str, Any]) -> Tensor:
-        """Copy a tensor to another type or device, by the arguments of ``aten._to_copy``."""
+        """Copy a tensor to another type or device, with the arguments of ``aten._to_copy``."""
         target = kwargs.get("device")
         device_type = torch.device(target).type if target is not None else source.device.type
         is_blocking = not kwargs.get("non_blocking")
@@ -336,7 +335,9 @@ class PretendedGPU(TorchDispatchMode):
         return target
 
     def _check_devices(self, func: Any, name: str, args: Any, tensors: list[Tensor]) -> None:
-        """Check that tensors are on one device; single numbers and some indices may be on the CPU.
+        """Check that tensors are on one device.
+
+        Tensors of dimension 0, and indices into a tensor on the device, may be on the CPU.
 
         Args:
             func: Operation of torch.
@@ -370,7 +371,7 @@ class PretendedGPU(TorchDispatchMode):
     def _part_of_gradient(self) -> str:
         """Part whose gradient autograd is computing.
 
-        Gradients are added up outside of the nodes of the forward pass, which is counted for
+        Sums of gradients belong to no node of the forward pass. They are counted for
         ``backward: sums``.
         """
         node = torch._C._current_autograd_node()
@@ -445,7 +446,8 @@ def _short_name(file: str) -> str | None:
 def _num_launches(name: str, args: Any) -> int:
     """Number of kernels of an operation.
 
-    Operations on lists need one kernel for each group of ``_TENSORS_PER_LAUNCH`` tensors.
+    Operations on lists of tensors need one kernel for each group of tensors, whose size is in
+    ``_TENSORS_PER_LAUNCH``.
     """
     if not name.startswith(("_foreach", "_fused_adam", "_fused_sgd")):
         return 1
@@ -493,7 +495,7 @@ def _attention(
 ) -> Tensor:
     """Compute attention.
 
-    Tensors on the pretended GPU use torch's memory-efficient kernel, whatever the mask is.
+    Tensors on the pretended GPU use torch's memory-efficient kernel, with any mask and without one.
 
     Args:
         query: Queries. (B, heads, N, C)
@@ -501,7 +503,7 @@ def _attention(
         value: Values. (B, heads, K, C)
         attn_mask: True where attention is allowed, or values to add to the logits. (..., N, K)
         dropout_p: Probability of dropout.
-        is_causal: Whether a query attends to earlier keys alone.
+        is_causal: Whether a query attends only to keys at or before its position.
         kwargs: Further arguments of torch's function.
 
     Returns:

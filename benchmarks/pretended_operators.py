@@ -1,7 +1,7 @@
-"""Sets of operators by their launches and waits on the pretended GPU, and counterparts for the CPU.
+"""Operators on the pretended GPU: which of them launch a kernel or wait, and their CPU versions.
 
 The pretended GPU (`benchmarks.pretended_gpu`) computes on the CPU. It counts the kernels that would
-be launched on a GPU, and the times at which the host would wait for it.
+be launched on a GPU, and how often the host would wait for the GPU.
 """
 
 from collections.abc import Callable
@@ -16,8 +16,8 @@ from gsmap.ops.kernel_sampling.reference import sample_kernels_reference
 
 aten = torch.ops.aten
 
-# Operations without a launch. Views have no launch either. They are not listed, because the schema
-# of an operation shows that its result is a view.
+# Operations that launch no kernel. Views launch none either, but they are not listed: the schema of
+# an operation shows whether its result is a view.
 FREE = {
     aten.detach.default,
     aten.alias.default,
@@ -35,7 +35,7 @@ FREE = {
     aten.is_same_size.default,
     aten.sym_size.int,
 }
-# Operations for which the host waits, as it reads their result, or its size, from the GPU.
+# Operations that make the host wait, because it reads their result or its size from the GPU.
 WAITS = {
     aten._local_scalar_dense.default,
     aten.is_nonzero.default,
@@ -48,7 +48,7 @@ WAITS = {
     aten.unique_dim.default,
     aten._linalg_check_errors.default,
 }
-# Operations whose result is a number of Python.
+# Operations whose result is a Python number or bool.
 READS = {aten._local_scalar_dense.default, aten.is_nonzero.default, aten.equal.default}
 # Operations whose second argument is a list of indices, which may be on the CPU.
 INDEXING = {
@@ -71,7 +71,7 @@ def _attention_weights(query: Tensor, key: Tensor, bias: Tensor | None, scale: f
 def _efficient_attention(
     query: Tensor, key: Tensor, value: Tensor, bias: Tensor | None, *_: Any, **options: Any
 ) -> tuple[Tensor, ...]:
-    """Attention by matrix products, without dropout.
+    """Compute attention with matrix products, without dropout.
 
     Args:
         query: Queries. (B, heads, N, C)
@@ -81,7 +81,8 @@ def _efficient_attention(
         options: ``scale`` of the logits, by default 1 / sqrt(C).
 
     Returns:
-        Weighted sums of the values (B, heads, N, C), and placeholders of the kernel's state.
+        Weighted sums of the values (B, heads, N, C), and zeros in place of the three other results
+        of the GPU's kernel: the log-sums of the softmax and the state of the random generator.
     """
     scale = options.get("scale") or query.shape[-1] ** -0.5
     weights = _attention_weights(query.float(), key.float(), bias=bias, scale=scale)
@@ -100,7 +101,7 @@ def _efficient_attention_backward(
     *_: Any,
     **options: Any,
 ) -> tuple[Tensor, ...]:
-    """Gradients of `_efficient_attention` in query, key and value; the gradient of the bias is 0.
+    """Compute the gradients of `_efficient_attention`. The gradient of the bias is set to 0.
 
     Args:
         grad: Gradient of the result. (B, heads, N, C)
@@ -117,7 +118,7 @@ def _efficient_attention_backward(
     scale = options.get("scale") or query.shape[-1] ** -0.5
     weights = _attention_weights(query, key, bias=bias, scale=scale)
     grad_weights = grad @ value.transpose(-1, -2)
-    # Gradient of a softmax w: w * (g - sum(g * w)), then of the scaling.
+    # The gradient of a softmax w is w * (g - sum(g * w)). The scaling of the logits multiplies it.
     grad_logits = weights * (grad_weights - (grad_weights * weights).sum(-1, keepdim=True)) * scale
     grad_query = grad_logits @ key
     grad_key = grad_logits.transpose(-1, -2) @ query
@@ -126,7 +127,7 @@ def _efficient_attention_backward(
     return grad_query, grad_key, grad_value, grad_bias
 
 
-# Operations of torch without a kernel for the CPU.
+# Functions that replace the operations of torch without a kernel for the CPU.
 REPLACEMENTS: dict[Any, Callable[..., Any]] = {
     aten._scaled_dot_product_efficient_attention.default: _efficient_attention,
     aten._scaled_dot_product_efficient_attention_backward.default: _efficient_attention_backward,
@@ -136,7 +137,7 @@ REPLACEMENTS: dict[Any, Callable[..., Any]] = {
 def _sample_deformably(
     value: Tensor, locations: Tensor, weights: Tensor, height: int, width: int
 ) -> Tensor:
-    """Reference of the operator ``deformable_sample``."""
+    """Compute the operator ``deformable_sample`` by its reference."""
     result = deformable_sample(value, (height, width), locations, weights, backend="reference")
     num_heads = weights.shape[2]
     return result.unflatten(2, (num_heads, -1))  # the operator's result has an axis of heads
@@ -152,12 +153,13 @@ def _sample_kernels(
     width: int,
     bilinear: bool,
 ) -> Tensor:
-    """Reference of the operator ``sample_kernels``."""
+    """Compute the operator ``sample_kernels`` by its reference."""
     shape = (height, width)
     return sample_kernels_reference(value, shape, uv, visible, weights, offsets, bilinear)
 
 
-# The project's operators without a kernel for the CPU, differentiable in their first three tensors.
+# References of the project's operators without a kernel for the CPU, by the name of the operator.
+# They are differentiable in their first three tensors.
 _REFERENCES: dict[str, Callable[..., Tensor]] = {
     "deformable_sample": _sample_deformably,
     "sample_kernels": _sample_kernels,
@@ -172,18 +174,19 @@ def run_cpu_kernel(name: str, args: Any) -> Any:
         args: Arguments on the CPU; the last one is the backend.
 
     Returns:
-        Result of the operator; of a ``_backward`` operator the gradients.
+        Result of the operator. For a ``_backward`` operator, this is a list of gradients.
     """
     inputs = [arg.detach() if isinstance(arg, Tensor) else arg for arg in args[:-1]]
     operator = name.removeprefix("gsmap.")
     reference = _REFERENCES.get(operator.removesuffix("_backward"))
     if reference is None:
-        # An operator NAME_in_warps is a variant for the GPU of the operator NAME.
+        # The operator NAME_in_warps is a GPU variant of the operator NAME.
         kernel = getattr(torch.ops.gsmap, operator.replace("_in_warps", ""))
         return kernel(*inputs, "cpu")
     if not operator.endswith("_backward"):
         return reference(*inputs)
-    upstream, *inputs = inputs  # a backward operator takes the gradient of the result first
+    # The first argument of a backward operator is the gradient of the result.
+    upstream, *inputs = inputs
 
     def gradients() -> list[Tensor]:
         leaves = [tensor.requires_grad_() for tensor in inputs[:3]]
@@ -191,7 +194,7 @@ def run_cpu_kernel(name: str, args: Any) -> Any:
         grads = torch.autograd.grad(result, leaves, grad_outputs=upstream, materialize_grads=True)
         return list(grads)
 
-    # Inside of the dispatch mode of `PretendedGPU`, autograd is off. Another thread is outside of
-    # this mode, so autograd works there.
+    # Autograd is off inside of the dispatch mode of `PretendedGPU`. The gradients are computed in
+    # another thread, because the mode does not apply there.
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(gradients).result()

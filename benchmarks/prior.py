@@ -49,7 +49,8 @@ def run(args: argparse.Namespace) -> None:
         read_ms, write_ms = frame_times_ms(rule, repeats=args.repeats)
         file_bytes, cost = in_own_process(drive, rule, args.km)
         size_gb = file_bytes / 1e9 / args.km * 1000
-        frame_ms = 1e3 * cost.cpu_s / (1000 * args.km / STEP_M)
+        num_frames = 1000 * args.km / STEP_M
+        frame_ms = 1e3 * cost.cpu_s / num_frames
         row = [type(rule).__name__, f"{read_ms:.2f}", f"{write_ms:.2f}", f"{frame_ms:.2f}"]
         row += [f"{size_gb:.2f}", f"{cost.peak_bytes / MIB:.0f}"]
         rows.append(row)
@@ -80,7 +81,7 @@ def prediction(index: int) -> NDArray[np.float32]:
 
 
 def pose_at(distance_m: float) -> NDArray[np.float64]:
-    """Pose on a road of parallel pieces along y, each of which winds slowly. (4, 4)"""
+    """Pose at a distance along a road, which consists of parallel winding pieces along y. (4, 4)"""
     row, along_m = divmod(distance_m, ROW_M)  # index of the piece, and the position on it
     yaw = 0.3 * math.sin(distance_m / 300)
     pose = np.eye(4)
@@ -91,11 +92,11 @@ def pose_at(distance_m: float) -> NDArray[np.float64]:
 
 
 def cycle_poses(number: int, offset_m: float) -> Iterator[NDArray[np.float64]]:
-    """Yield the poses of the first frames of a road again and again, each moved along the road.
+    """Yield the poses of the first frames of a road in an endless cycle.
 
     Args:
         number: Number of frames.
-        offset_m: Distance by which each pose is moved along the road, in metres.
+        offset_m: Distance along the road from each frame to its pose, in metres.
     """
     for index in cycle(range(number)):
         yield pose_at(STEP_M * index + offset_m)

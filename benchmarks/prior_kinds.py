@@ -1,4 +1,4 @@
-"""Map priors of rasters and of Gaussians, side by side on the same drives."""
+"""Comparison of map priors that store rasters or Gaussians, on the same simulated drives."""
 
 import math
 import tempfile
@@ -28,15 +28,15 @@ NOISE_M = 0.25  # standard deviation of the error of a predicted line, across it
 MISSED = 0.15  # share of the true lines that a frame does not predict
 FALSE = 0.3  # average number of false lines that a frame predicts
 WIDTH_M = 0.6  # width of lines in rasters and in the truth
-# Offset of each line in metres, positive to the right of the road, and its class.
+# Lines of the road: offset from its middle in metres (positive to the right), index of the class.
 _LINES = ((-7.0, 1), (-3.5, 0), (0.0, 0), (3.5, 0), (7.0, 1))
 _NUM_POINTS = 20  # number of points of a predicted line
 Frame = tuple[NDArray[np.float64], MapElements]
-"""Pose (4, 4) and elements in the frame."""
+"""Pose of the vehicle in the global frame (4, 4), and predicted elements in the vehicle frame."""
 
 
 def road(distance_m: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
-    """Points beside a winding road. (n,) -> (n, 2)
+    """Points along a winding road, in metres in the global frame. (n,) -> (n, 2)
 
     Args:
         distance_m: Position of each point along y, in metres.
@@ -56,7 +56,7 @@ def true_lines(length_m: float) -> list[tuple[NDArray[np.float64], int]]:
 
 
 def pose_on_road(distance_m: float, beside_m: float) -> NDArray[np.float64]:
-    """Pose of a vehicle on the road, whose y axis is ahead. (4, 4)
+    """Pose of a vehicle on the road, with the y axis of its frame pointing ahead. (4, 4)
 
     Args:
         distance_m: Position along the road, in metres.
@@ -74,17 +74,18 @@ def pose_on_road(distance_m: float, beside_m: float) -> NDArray[np.float64]:
 def elements_in_range(
     lines: list[tuple[NDArray[np.float64], int]], pose: NDArray[np.float64]
 ) -> MapElements:
-    """Cut lines to the range of a frame.
+    """Transform lines to a frame and cut them to its range.
 
     Args:
         lines: Lines in the global frame, with their classes.
-        pose: Pose of the frame. (4, 4)
+        pose: Pose of the frame in the global frame. (4, 4)
     """
     pieces = []
     labels = []
     for line, label in lines:
         is_near = np.abs(line - pose[:2, 3]).max(axis=1) < 60
-        local = (line[is_near] - pose[:2, 3]) @ pose[:2, :2]  # rows @ R: the inverse rotation
+        # The product of row vectors with a rotation matrix is the inverse rotation.
+        local = (line[is_near] - pose[:2, 3]) @ pose[:2, :2]
         for piece in clip_to_box(local, GRID.x_range, GRID.y_range):
             pieces.append(piece)
             labels.append(label)
@@ -106,7 +107,8 @@ def predict(truth: MapElements, rng: np.random.Generator) -> MapElements:
         index = np.linspace(0, len(line) - 1, _NUM_POINTS)
         x = np.interp(index, np.arange(len(line)), line[:, 0])
         y = np.interp(index, np.arange(len(line)), line[:, 1])
-        # The error is a constant plus a wave, each of variance 1, scaled to NOISE_M in all.
+        # The error is a constant plus a wave along the line, each of variance 1. The factors after
+        # them scale the standard deviation of the sum to NOISE_M.
         phase = rng.uniform(0, 2 * math.pi)
         bend = math.sqrt(2) * np.sin(np.linspace(0, 6, _NUM_POINTS) + phase)
         shift = NOISE_M * (rng.normal() + bend) / math.sqrt(2)
@@ -121,7 +123,7 @@ def predict(truth: MapElements, rng: np.random.Generator) -> MapElements:
 
 
 def drives(length_m: float) -> list[Frame]:
-    """Predictions of several drives along the road, whose frames lie at different places."""
+    """Simulate predictions of several drives along the road, each with frames at other places."""
     lines = true_lines(length_m)
     rng = np.random.default_rng(0)
     frames = []
@@ -134,7 +136,7 @@ def drives(length_m: float) -> list[Frame]:
 
 
 def draw(elements: MapElements) -> Tensor:
-    """Draw the lines of each class, with their scores. (C, H, W)"""
+    """Draw the lines of each class to a raster of their scores. (C, H, W)"""
     masks = torch.zeros(len(SETTINGS.classes), GRID.height, GRID.width)
     for line, label, score in elements.rows:
         mask = draw_polylines(torch.from_numpy(line)[None].float(), GRID, width_m=WIDTH_M)[0]
@@ -197,7 +199,7 @@ def _figures(
     read: Callable[[NDArray[np.float64]], Tensor],
     save: Callable[[Path], None],
 ) -> list[str]:
-    """Write all frames, and read the frames of the last drive.
+    """Measure a prior: write all frames to it, and read it at the frames of the last drive.
 
     Args:
         frames: Poses and predictions.
@@ -207,8 +209,8 @@ def _figures(
         save: Saves the prior.
 
     Returns:
-        Milliseconds of a write and of a read, megabytes per 1,000 km, and the largest IoU with its
-        threshold.
+        Cells of the table: milliseconds of a write and of a read, megabytes per 1,000 km, and the
+        largest IoU with the true lines and its threshold.
     """
     start_s = time.process_time()
     for pose, elements in frames:

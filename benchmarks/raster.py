@@ -20,11 +20,11 @@ from gsmap.ops.raster_loss import raster_loss
 from gsmap.ops.soft_iou import pairwise_soft_iou
 from gsmap.structures.grid import BEVGrid
 
-SIZES = ((128, 64), (200, 100), (256, 128), (480, 240))
-SCALES_M = ((1.0, 0.4), (0.2, 0.2), (5.0, 5.0))
-POINTS = 20
-TRAINING_SIZE = (200, 100)
-RATE_REPEATS = 20
+SIZES = ((128, 64), (200, 100), (256, 128), (480, 240))  # height and width of rasters in pixels
+SCALES_M = ((1.0, 0.4), (0.2, 0.2), (5.0, 5.0))  # standard deviations along both axes
+POINTS = 20  # Gaussians per instance
+TRAINING_SIZE = (200, 100)  # height and width in pixels
+RATE_REPEATS = 20  # timed calls in the measurements of the floor
 # Time and memory of the reference are linear in the number of instances. They are measured on as
 # many instances as fill a tensor of this size, and scaled up. With smaller tensors, memory that
 # malloc keeps after they are freed would blur the peak memory.
@@ -143,7 +143,7 @@ def byte_seconds(device: torch.device) -> float:
 
 
 def exponential_seconds(device: torch.device) -> float:
-    """Measure the seconds of an exponential of the CPU kernels.
+    """Measure the seconds that the CPU kernels take for one exponential.
 
     The result is 0 on a GPU, whose kernels are limited by its memory.
     """
@@ -174,7 +174,7 @@ def rendering_table(args: argparse.Namespace) -> str:
         args: Parsed options of ``add_arguments``.
 
     Returns:
-        Markdown table, with the rates that its floors come from.
+        The rates from which the floors are computed, then the Markdown table.
     """
     device = torch.device(args.device)
     backend = "triton" if device.type == "cuda" else "cpu"

@@ -1,9 +1,9 @@
 """AP_chamfer and AP_raster by the algorithms of the reference evaluators, for comparison.
 
 The algorithms are slow. AP_chamfer resamples lines by one shapely call per point, and computes all
-distances again for each threshold. It compares two lines only if their strips touch; strips are
-shapely buffers, which a tree finds. AP_raster draws and dilates a whole canvas for each element,
-and compares run-length codes.
+distances again for each threshold. It compares two lines only if the strips around them touch; the
+strips are shapely buffers in a search tree. AP_raster draws and dilates a whole canvas for each
+element, and compares run-length codes of the canvases.
 """
 
 from collections.abc import Sequence
@@ -54,7 +54,8 @@ def _chamfer_hits(pred: list[np.ndarray], gt: list[np.ndarray], threshold: float
         threshold: Greatest Chamfer distance of a match, in metres.
 
     Returns:
-        Whether each prediction matches a ground truth that no earlier one matches.
+        Whether the nearest ground truth of each prediction is within the threshold and not matched
+        by an earlier prediction.
     """
     # Lines whose strips do not touch stay at 100 m, farther than each threshold.
     distances = np.full((len(pred), len(gt)), 100.0)
@@ -127,14 +128,14 @@ def _encode_masks(
     """Run-length codes of the dilated masks of some elements.
 
     Args:
-        elements: Elements of a frame.
-        rows: Indices of the elements. (n,)
-        polygon: Whether to fill the elements.
-        config: Rules.
+        elements: All elements of a frame.
+        rows: Indices of the elements to encode. (n,)
+        polygon: Whether to draw the elements as filled polygons; otherwise, as lines.
+        config: Rules of AP_raster.
         by_opencv: Whether OpenCV fills polygons, instead of the rasterizer of `gsmap.evaluation`.
 
     Returns:
-        One code per element.
+        One code of pycocotools per element.
     """
     width, height = config.size_px
     if polygon and not by_opencv:
@@ -156,10 +157,10 @@ def _encode_masks(
 
 
 def _raster_hits(ious: np.ndarray, threshold: float) -> list[bool]:
-    """Match predictions, in descending order of score, with the free ground truth of highest IoU.
+    """Match each prediction, best first, with the unmatched ground truth of highest IoU.
 
     Args:
-        ious: IoU of each prediction with each ground truth. (N, K)
+        ious: IoU of each prediction, in descending order of score, with each ground truth. (N, K)
         threshold: Smallest IoU of a match.
 
     Returns:
@@ -185,10 +186,10 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig, by_opencv: bool = 
 
     Args:
         frames: Predictions and ground truth of each sample.
-        config: Rules.
-        by_opencv: Whether the installed OpenCV fills polygons. Its versions differ in pixels along
-            the outline (``FILLS_AS_RELEASED``). Otherwise `gsmap.evaluation` fills them, with the
-            pixels of the published AP. OpenCV draws lines in both cases.
+        config: Rules of AP_raster.
+        by_opencv: Whether the installed OpenCV fills polygons. Versions of OpenCV differ in pixels
+            along the outline (``FILLS_AS_RELEASED``). If False, `gsmap.evaluation` fills polygons
+            with the pixels of the published AP. OpenCV draws lines in both cases.
 
     Returns:
         Mean over classes and thresholds, in [0, 1]; classes without ground truth are left out.

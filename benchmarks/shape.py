@@ -21,8 +21,8 @@ from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 
-MIN_SCORE = 0.2
-FOLD_DEG = 90.0  # a vertex with a larger turn is a fold, at which the line leads back
+MIN_SCORE = 0.2  # smallest score of a predicted line that counts
+FOLD_DEG = 90.0  # a vertex with a larger turn is a fold: the line runs back from there
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
-    """Shapes of the predicted lines that match a ground truth.
+    """Measure the shapes of the predicted lines that match a ground truth.
 
     Args:
         results: Result file.
@@ -89,7 +89,8 @@ def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
             continue
         truth_lines = truths[matches.token].polylines
         pred_lines = predictions[matches.token].polylines
-        truth_indices = matches.matched_gt[:, -1]  # within 1.5 m, the largest threshold, or -1
+        # Ground truth of each prediction within 1.5 m, the largest threshold, or -1.
+        truth_indices = matches.matched_gt[:, -1]
         for index, label, score, truth_index in zip(
             matches.pred_index, matches.labels, matches.scores, truth_indices, strict=True
         ):
@@ -103,7 +104,7 @@ def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
 
 
 def length_m(line: FloatArray) -> float:
-    """Length of a polyline (P, 2) or (P, 3) in metres, in the plane."""
+    """Length in metres of a polyline (P, 2) or (P, 3), projected to the plane."""
     steps = np.diff(line[:, :2], axis=0)
     return float(np.linalg.norm(steps, axis=1).sum())
 
@@ -119,5 +120,6 @@ def turns(line: FloatArray) -> tuple[float, float]:
     """
     edges = np.diff(line[:, :2], axis=0)
     headings = np.degrees(np.arctan2(edges[:, 1], edges[:, 0]))
-    angles = np.abs((np.diff(headings) + 180.0) % 360.0 - 180.0)  # differences in [0, 180]
+    differences = (np.diff(headings) + 180.0) % 360.0 - 180.0  # in [-180, 180)
+    angles = np.abs(differences)
     return float(angles.mean()), float((angles > FOLD_DEG).mean())

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Measure and print the processor time of a frame.
 
-    The first frame is left out, as it compiles the kernels.
+    The first frame is left out, because the kernels are compiled during it.
 
     Args:
         args: Parsed options of ``add_arguments``.
@@ -47,17 +47,18 @@ def run(args: argparse.Namespace) -> None:
     times_ms: dict[tuple[int, ...], list[float]] = {size: [] for size in settings_by_size}
 
     def time_lines(maps: Any) -> object:
-        """Vectorise maps in every size, note the times, and return the lines of the last size."""
+        """Convert maps to lines in every size, record the times, and return the last lines."""
         for size, size_settings in settings_by_size.items():
             head.vectorizing = size_settings
             resized_values = [resize_map(values, size) for values in maps]
             resized = type(maps)._make(resized_values)  # a NamedTuple
             start = time.process_time()
             lines = vectorize_maps(resized)
-            times_ms[size].append(1000 * (time.process_time() - start))
+            elapsed_s = time.process_time() - start
+            times_ms[size].append(1000 * elapsed_s)
         return lines
 
-    head.lines = time_lines  # takes the place of the method
+    head.lines = time_lines  # replaces the method, which `vectorize_maps` still refers to
     rows_to_predict = range(min(args.samples + 1, len(dataset)))
     for _ in inferencer.predict(dataset, rows_to_predict):
         pass

@@ -1,8 +1,8 @@
-"""What MkDocs needs to show the repository's pages as a site (mkdocs.yml).
+"""Hooks of MkDocs that show the repository's pages as a site (mkdocs.yml).
 
-Pages outside docs/ become pages of the site. Links between Markdown files stay as they work in the
-repository; here they are turned into links of the site. A link to a file of code leads to a page
-that shows it.
+Markdown files outside docs/ become pages of the site. In the repository, links between Markdown
+files are relative paths. The hooks turn them into links of the site. A link to a source file leads
+to a page that shows the file.
 """
 
 import html
@@ -20,7 +20,7 @@ from mkdocs.structure.pages import Page
 from gsmap.methods import METHODS
 
 REPO = Path(__file__).resolve().parents[1]
-# page of the site -> file of the repository
+# Page of the site -> Markdown file of the repository outside docs/.
 OUTSIDE = {
     "overview.md": "README.md",
     "changelog.md": "CHANGELOG.md",
@@ -31,9 +31,10 @@ OUTSIDE = {
     "minicity.md": "projects/MiniCity/README.md",
 }
 OUTSIDE |= {f"results/{path.name}": f"results/{path.name}" for path in REPO.glob("results/*.md")}
+# The inverse: file of the repository -> page of the site.
 PAGES = {source: page for page, source in OUTSIDE.items()}
 LANGUAGES = {".py": "python", ".sh": "bash", ".json": "json"}
-# fenced and inline code are left alone
+# The first two alternatives match fenced and inline code, which has no ``target`` and is kept.
 LINK = re.compile(
     r"```.*?```|`[^`\n]*`|\]\((?P<target>[^)\s:#]+)(?P<anchor>#[^)\s]*)?\)", re.DOTALL
 )
@@ -49,33 +50,47 @@ def source_page(path: str) -> str:
 
 def links(text: str, folder: str) -> set[str]:
     """Return the files of the repository, outside docs/, that a page in ``folder`` links to."""
-    targets = (match["target"] for match in LINK.finditer(text) if match["target"])
-    paths = (posixpath.normpath(posixpath.join(folder, target)) for target in targets)
-    return {p for p in paths if not p.startswith(("docs/", "../")) and (REPO / p).is_file()}
+    paths = set()
+    for match in LINK.finditer(text):
+        if not match["target"]:  # the match is code
+            continue
+        path = posixpath.normpath(posixpath.join(folder, match["target"]))
+        is_outside = not path.startswith(("docs/", "../"))
+        if is_outside and (REPO / path).is_file():
+            paths.add(path)
+    return paths
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Put the pages of the methods behind their comparison, in the order of their list."""
+    """Insert the pages of the methods into the navigation, after ``methods.md``.
+
+    They come in the order of `METHODS`. Methods without a page are left out.
+    """
+    # The navigation has exactly one part "Models", a list of entries {title: page}.
     (models,) = (part["Models"] for part in config.nav or () if "Models" in part)
     place = next(n for n, page in enumerate(models, start=1) if "methods.md" in page.values())
-    pages = {method.title: f"methods/{method.name}.md" for method in METHODS}
-    written = {title: page for title, page in pages.items() if (REPO / "docs" / page).is_file()}
-    models[place:place] = [{title: page} for title, page in written.items()]
+    entries = []
+    for method in METHODS:
+        page = f"methods/{method.name}.md"
+        if (REPO / "docs" / page).is_file():
+            entries.append({method.title: page})
+    models[place:place] = entries
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages outside docs/ and a page for each file of code that a page links to."""
-    shown = set()
+    """Add the pages outside docs/, and a page for each source file that a page links to."""
+    linked = set()
     for file in files.documentation_pages():
-        shown |= links(file.content_string, posixpath.dirname(f"docs/{file.src_uri}"))
+        linked |= links(file.content_string, posixpath.dirname(f"docs/{file.src_uri}"))
     for page, source in OUTSIDE.items():
         text = (REPO / source).read_text(encoding="utf-8")
-        shown |= links(text, posixpath.dirname(source))
+        linked |= links(text, posixpath.dirname(source))
         files.append(File.generated(config, page, content=text))
-    for path in sorted(shown - PAGES.keys()):
+    for path in sorted(linked - PAGES.keys()):
         text = (REPO / path).read_text(encoding="utf-8")
         language = LANGUAGES.get(Path(path).suffix, "text")
+        # Four backticks, as the text may contain fences of three.
         content = f"---\nsearch: {{exclude: true}}\n---\n# {path}\n\n````{language}\n{text}\n````\n"
         files.append(File.generated(config, source_page(path), content=content))
     return files
@@ -106,14 +121,18 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Show equations as MathML, names without their roles, and where a name is imported from."""
+    """Convert equations to MathML, remove roles before names, and add import lines to headings."""
     content = MATH.sub(lambda match: convert(html.unescape(match[1])), content)
     return NAME.sub(with_import, ROLE.sub("", content))
 
 
 def with_import(heading: re.Match[str]) -> str:
-    """Return the heading of a class or function, with the line that imports it below."""
+    """Return the heading of a class or function, followed by the line that imports it.
+
+    The import is from the outermost package that lists the name in ``__all__``, or else from the
+    module that defines the name.
+    """
     module, name = heading.groups()
-    packages = accumulate(module.split("."), "{}.{}".format)
-    offers = (path for path in packages if name in getattr(import_module(path), "__all__", ()))
-    return f"{heading[0]}<p><code>from {next(offers, module)} import {name}</code></p>"
+    packages = accumulate(module.split("."), "{}.{}".format)  # a, a.b and a.b.c for a.b.c
+    exporters = (path for path in packages if name in getattr(import_module(path), "__all__", ()))
+    return f"{heading[0]}<p><code>from {next(exporters, module)} import {name}</code></p>"

@@ -1,4 +1,4 @@
-"""Node of ROS 2 that takes rectified images and their CameraInfo, and publishes map elements.
+"""ROS 2 node that takes rectified images and their CameraInfo, and publishes map elements.
 
 The map elements are published as markers. Copy this file, and replace the constants below by the
 cameras and frames of your vehicle.

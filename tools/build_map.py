@@ -68,6 +68,7 @@ EXTRAS = {"rrd": ("rerun", "viz"), "mcap": ("foxglove", "viz"), "mp4": ("av", "v
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
+    """Parse and check the options of the command."""
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -170,7 +171,7 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
-    """Refuse options that exclude each other, or that need another option."""
+    """Exit with an error if options exclude each other, or need another option."""
     if args.results is None and not args.map:
         parser.error("give results, or a --map for a --prior")
     if args.results is None and (args.changes or args.out):
@@ -187,7 +188,7 @@ def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace
 
 
 def check_prior_options(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
-    """Refuse options that do not fit ``--prior``."""
+    """Exit with an error if options do not fit ``--prior``."""
     if args.gaussians and not (args.prior and args.results):
         parser.error("--gaussians is for a --prior of results: give both, too")
     if args.gaussians and args.map:
@@ -205,7 +206,8 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
 
     Raises:
         ImportError: If a package is missing.
-        ValueError: If an option is out of range, or the place of the global frame is unknown.
+        ValueError: If an option is out of range, options exclude each other, samples have no poses,
+            their positions do not fit the origin, or the origin is unknown and a format needs it.
     """
     if not 0 < args.speed_limit < math.inf:
         raise InputError(f"--speed-limit must be > 0, got {args.speed_limit}.")
@@ -292,7 +294,7 @@ def find_origin(
     """Place of the global frame on the earth, or None if it is unknown.
 
     Args:
-        args: The options of the command; ``--crs`` and ``--origin`` come first.
+        args: The options of the command; ``--crs`` and ``--origin`` have priority.
         ann: The samples.
         map_name: Name of the map of the samples. Its origin is known in nuScenes and Argoverse 2.
     """
@@ -317,7 +319,7 @@ def write_map(
         elements: The map, in the global frame.
 
     Returns:
-        The files.
+        Paths of the written files.
     """
     classes = drive.classes
     origin = find_origin(args, ann, drive.frames[0].sample.map_name)
@@ -399,7 +401,7 @@ def score(passes: list[Pass], ann: AnnotationFile, out: Path) -> None:
     Args:
         passes: The drives with their merged maps.
         ann: The samples, with ground truth.
-        out: Folder of the figures.
+        out: Folder of ``scores.json``.
     """
     instances = read_truth(ann)
     drives = []
@@ -422,10 +424,10 @@ def score(passes: list[Pass], ann: AnnotationFile, out: Path) -> None:
 
 
 def place_of(ann: AnnotationFile, scenes: Iterable[str]) -> str:
-    """Name of the map of drives.
+    """Name of the place of drives, the ``map_name`` of their samples.
 
     Raises:
-        ValueError: If the drives lie in different places, or do not exist.
+        ValueError: If the drives are in different places, or do not exist.
     """
     chosen = set(scenes)
     places = set()
@@ -511,7 +513,7 @@ def write_element_prior(
         maps: Maps in the global frame.
 
     Raises:
-        ValueError: If there are several maps, whose elements may lie upon each other.
+        ValueError: If there is not exactly one map. The elements of several maps may overlap.
     """
     from gsmap.prior import ElementPrior, PriorSettings
 
@@ -555,7 +557,7 @@ def write_gaussian_prior(
 
 
 def merge_config(args: argparse.Namespace) -> MergeConfig:
-    """Parameters of merging by the options of the command."""
+    """Parameters of merging from the options of the command."""
     return MergeConfig(
         gaussians=not args.no_gaussians,
         min_confidence=args.min_confidence,
@@ -577,7 +579,7 @@ def group_scenes(
         Scenes by the name of the scene or of the place.
 
     Raises:
-        ValueError: If drives are to be joined, and the place of one is unknown.
+        ValueError: If drives are joined, and the place of a drive is unknown.
     """
     if not args.join:
         return {scene: [scene] for scene in scenes}

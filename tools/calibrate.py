@@ -113,7 +113,7 @@ def main() -> str:
         SIGNALS: source.can_bus,
         CALIBRATION: {"law": args.law, "sigmas": args.sigmas},
     }
-    if source.dataset_meta:  # a test warns of samples of this split
+    if source.dataset_meta:  # with it, a test can warn about samples of the training's split
         meta["dataset_meta"] = dict(source.dataset_meta)
     if source.image_size:
         meta[IMAGE_SIZE] = source.image_size

@@ -169,7 +169,7 @@ def listing(tables: list[dict[str, Any]]) -> Iterator[str]:
 
 def slurm_commands(runs: list[Run], partition: str) -> str:
     """Commands for the unfinished runs, one per line: this command with ``--only`` for each run."""
-    # A parser that knows --slurm alone returns all other words of this command line.
+    # A parser with the single option --slurm returns all other words of this command line.
     slurm_option = argparse.ArgumentParser(add_help=False)
     slurm_option.add_argument("--slurm")
     _, other_words = slurm_option.parse_known_args()
@@ -183,7 +183,7 @@ def slurm_commands(runs: list[Run], partition: str) -> str:
 
 
 def train(runs: list[Run]) -> None:
-    """Train and test the unfinished runs, and print the end of each."""
+    """Train and test the unfinished runs, and print how each run ended."""
     for run, state in execute(runs):
         Progress.write(f"{run.label}: {state}")
         sys.stdout.flush()

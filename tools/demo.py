@@ -150,8 +150,8 @@ class Step:
         if stamp.exists() and all(product.exists() for product in self.products):
             print(f"{position} {self.title}: done before, skipped", flush=True)
             return
-        shell = self.command[0].endswith(".sh")
-        command = self.command if shell else [sys.executable, *self.command]
+        is_shell_script = self.command[0].endswith(".sh")
+        command = self.command if is_shell_script else [sys.executable, *self.command]
         print(f"{position} {self.title}: {shlex.join(command)}", flush=True)
         start_s = time.monotonic()
         environment = {**os.environ, "PYTHON": sys.executable}  # read by the shell scripts
@@ -174,7 +174,8 @@ class Step:
 def process_count() -> int:
     """Number of processes that train together: one per GPU, or per core without a GPU.
 
-    On a CPU a process of one thread per core uses the cores better than threads of one process.
+    On a CPU, one process with one thread per core uses the cores better than one process with many
+    threads.
     """
     import torch
 
@@ -295,8 +296,8 @@ def training_steps(training: Training, folder: Path, budget: Budget) -> Iterable
     checkpoint = work / f"epoch_{training.epochs}.pth"
     train = data_root(folder, budget, "train")
     val = data_root(folder, budget, "val")
-    # ``--data-root`` below sets the folder of all data sets. The first of these options takes
-    # precedence over it for the training.
+    # ``--data-root`` below sets the folder of all data sets. The first of these options overrides
+    # it for the training data.
     options = [
         f"train_dataloader.dataset.data_root={train}",
         f"train_cfg.max_epochs={training.epochs}",
@@ -374,17 +375,19 @@ def main() -> None:
     folder = Path(args.dir).resolve() / args.budget
     start_s = time.monotonic()
     runs = trainings(args.models, args.from_scratch, folder, budget)
-    shipped = list(data_steps(folder, budget, "val"))
+    steps = list(data_steps(folder, budget, "val"))
     for name in args.models:
-        shipped += shipped_steps(name, folder, budget)
-    trained = [*data_steps(folder, budget, "train"), prior_step(folder, budget)]
+        steps += shipped_steps(name, folder, budget)
+    num_shipped_steps = len(steps)  # after these steps, pictures of the shipped models exist
+    steps += data_steps(folder, budget, "train")
+    steps.append(prior_step(folder, budget))
     if "MapTR" not in args.models:  # other models start from it, so the table has it
-        trained += shipped_steps("MapTR", folder, budget)
+        steps += shipped_steps("MapTR", folder, budget)
     for training in runs:
-        trained += training_steps(training, folder, budget)
-    for number, step in enumerate([*shipped, *trained], 1):
-        step.run(folder, f"[{number}/{len(shipped) + len(trained)}]")
-        if number == len(shipped):
+        steps += training_steps(training, folder, budget)
+    for number, step in enumerate(steps, start=1):
+        step.run(folder, f"[{number}/{len(steps)}]")
+        if number == num_shipped_steps:
             minutes = (time.monotonic() - start_s) / 60
             for name in args.models:
                 work = folder / f"shipped_{name.lower()}"

@@ -61,7 +61,7 @@ from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import digest, digest_of_common, read_shard
 from gsmap.utils.words import format_count
 
-# Names of reports that are printed where they are made.
+# Reports that `print_reports` skips, because the code that makes them also prints them.
 PRINTED = ("intervals", "by", "uncertainty", "changes")
 
 
@@ -80,12 +80,12 @@ class TruthSettings(NamedTuple):
 
 
 def json_settings(path: Path) -> TruthSettings:
-    """Settings of ground truth in JSON, read from the entry ``meta`` of the file.
+    """Read the settings of ground truth in JSON from the entry ``meta`` of the file.
 
-    A missing setting has the value for nuScenes.
+    The default of a missing setting is its value for nuScenes.
 
     Args:
-        path: Ground truth, such as ``create_data.py export`` writes it.
+        path: Ground-truth file in JSON, for example written by ``create_data.py export``.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -99,12 +99,12 @@ def json_settings(path: Path) -> TruthSettings:
             raise InputError(f"classes must be a list of names, got {classes!r:.80}")
         low_x, high_x = meta.get("x_range", x_range)
         low_y, high_y = meta.get("y_range", y_range)
-        grid = BEVGrid((low_x, high_x), (low_y, high_y))
+        grid = BEVGrid((low_x, high_x), (low_y, high_y))  # raises an error for an invalid range
     return TruthSettings(tuple(classes), x_range=grid.x_range, y_range=grid.y_range)
 
 
 def metric_settings(args: argparse.Namespace) -> MetricSettings:
-    """Rules of the metrics, from the options and the annotation file."""
+    """Build the settings of the metrics from the options and the ground-truth file."""
     if args.ground_truth.suffix.lower() == ".json":
         described = json_settings(args.ground_truth)
     else:
@@ -164,7 +164,7 @@ def evaluate_results(
     """Score a result file.
 
     Args:
-        results: The result file, of ``--against`` or of the first argument.
+        results: The result file: the first argument of the command, or ``--against``.
         args: The options of the command.
         evaluator: The metrics and their rules.
     """
@@ -205,8 +205,8 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
         A line with the number of samples and the file.
     """
     require_own_matches(args.out, args.shard)
-    # The results are one file for all shards, or a file of results for this shard. If neither
-    # exists, `digest` raises the error for the first.
+    # The results are in one file for all shards, or in a file for this shard. If neither exists,
+    # `digest` raises an error that names the first one.
     results = args.results
     results_shard = args.shard.path_of(args.results)
     if args.results.exists() or not results_shard.exists():
@@ -267,7 +267,8 @@ def main(argv: list[str] | None = None) -> str:
     evaluator = build_evaluator(args, settings)
     if args.shard.count:
         return match_shard(args, evaluator, settings)
-    groups = read_groups(args)  # faults of these files end the command before it scores
+    # These files are read first, so that errors in them end the command before the scoring.
+    groups = read_groups(args)
     resamples = read_resamples(args)
     reports, notes = evaluate_input(args, evaluator)
     ranked = []  # reports of metrics with an AP

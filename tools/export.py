@@ -97,8 +97,8 @@ def open_samples(
     Args:
         inferencer: The model with its config.
         args: The options of the command.
-        source: The annotation file; None takes the file of the config.
-        split: ``train`` or ``test``, for the file of the config.
+        source: The annotation file; None for the annotation file in the config.
+        split: ``train`` or ``test``: the data loader of the config whose file is used.
 
     Raises:
         FileNotFoundError: If the file of the config does not exist.
@@ -115,7 +115,11 @@ def open_samples(
 
 
 def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInferencer:
-    """Export the model in the chosen precision, and open the written file."""
+    """Export the model in the chosen precision, and open the written file.
+
+    Raises:
+        ValueError: If the config lists no cameras.
+    """
     options = inferencer.cfg.test_dataloader.dataset
     if not options.get("cameras"):
         raise InputError(f"{args.config} lists no cameras: set test_dataloader.dataset.cameras.")
@@ -178,7 +182,7 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
     """
     dataset = open_samples(inferencer, args, args.samples, split="test")
     chosen = select_samples(dataset.annotations.column("token"), max_num=args.check)
-    # Indices of the classes whose points the model reorders to a short path.
+    # Indices of the classes whose points the model reorders to form a short path.
     unfolded = exported.metadata.get("unfold_classes", [])
     in_torch = inferencer.predict(dataset, chosen)
     samples = graph_inputs(exported, dataset, chosen)

@@ -49,8 +49,8 @@ if TYPE_CHECKING:  # slow to import
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
     from gsmap.prior.opening import AnyPrior
 
-_ONE_SAMPLE_HZ = 1e-4  # at this rate, only one sample is read of a drive
-_SAMPLES_SUFFIX = ".arrow"  # the file of the samples is named like --out, with this suffix
+_ONE_SAMPLE_HZ = 1e-4  # at this rate, only one sample of each drive is read
+_SAMPLES_SUFFIX = ".arrow"  # the annotation file of the samples is named like --out, but with this
 SKIPPED = 1  # exit code after broken frames
 IMPLAUSIBLE = 1  # exit code for an implausible calibration
 
@@ -175,7 +175,7 @@ def _add_picture_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _trained_cameras(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
-    """Cameras of the model's training, by name; empty if the checkpoint does not record them."""
+    """Cameras that the model was trained with, by name; empty if the checkpoint lacks them."""
     if not args.model:
         return {}
     from gsmap.apis.loading import trained_rig
@@ -196,8 +196,8 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
     Args:
         args: The options of the command.
         frames: Folder for images that the reader writes. If it is given, a single sample of each
-            drive is read. None reads all samples, and writes images into a folder beside the
-            output.
+            drive is read. If it is None, all samples are read, and images are written to a folder
+            beside the output.
 
     Raises:
         ValueError: If the input is not a recording.
@@ -229,10 +229,10 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
 
 
 def require_own_samples(path: Path) -> None:
-    """Check that an annotation file may be replaced, as an earlier run of this command wrote it.
+    """Check that an annotation file does not exist, or is from an earlier run of this command.
 
     Raises:
-        ValueError: If the file exists and another command wrote it.
+        ValueError: If the file exists and was not written by this command.
     """
     from gsmap.apis.input_dataset import INFERENCE_COMMAND
 
@@ -248,7 +248,9 @@ def require_own_samples(path: Path) -> None:
 
 
 def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
-    """Print implausible properties of the cameras; with ``--check-calibration``, draw them.
+    """Print warnings about implausible properties of the cameras.
+
+    With ``--check-calibration``, also draw the ground plane over the images of the first sample.
 
     Returns:
         The warnings.
@@ -289,7 +291,7 @@ def open_model(args: argparse.Namespace) -> "MapInferencer":
 
 
 def result_header(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, Any]:
-    """Header of the result file: classes, model and, where known, calibration and scene lists.
+    """Header of the result file: classes, model and, if known, calibration and lists of scenes.
 
     Args:
         args: The options of the command.
@@ -311,7 +313,7 @@ def result_header(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, A
 
 
 def run_settings(args: argparse.Namespace) -> dict[str, str]:
-    """Settings that determine the predictions of a sample."""
+    """Settings of the command that determine the predictions of a sample, by name."""
     checkpoint = chosen_checkpoint(args)
     settings = {"model": args.model[0], "checkpoint": digest(checkpoint)}
     for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp"):
@@ -327,12 +329,12 @@ def open_log(
     tokens: list[str],
     classes: Sequence[str],
 ) -> AbstractContextManager[ResultLog | None]:
-    """Open the log of the run's predictions; without ``--out`` there is none.
+    """Open the log of the predictions of this run. Without ``--out``, the context returns None.
 
     Args:
         args: The options of the command.
-        settings: Settings and input that determine the predictions. If an earlier run had equal
-            ones, its predictions are used.
+        settings: Settings and input that determine the predictions. If they equal the settings of
+            an earlier run, its predictions are used.
         tokens: Tokens of the samples to predict, in their order.
         classes: Names of the classes.
     """
@@ -374,7 +376,7 @@ def predict(
         if results and done:
             bar.write(f"going on after {len(done)} of {format_count(len(chosen), 'sample')}")
             broken.update(results.broken)
-            # A model that uses earlier frames must see all of them again.
+            # A model that uses earlier frames must process all of them again.
             if not remembers(inferencer):
                 bar.update(len(done))
                 chosen = [index for index in chosen if tokens[index] not in done]
@@ -407,7 +409,7 @@ def predict(
 
 
 def remembers(inferencer: "MapInferencer") -> bool:
-    """Whether the predictions of a model depend on earlier samples, by frames or by a prior."""
+    """Whether the predictions of a model depend on earlier samples, directly or through a prior."""
     return inferencer.model.temporal is not None or inferencer.model.prior is not None
 
 
@@ -425,7 +427,10 @@ def read_priors(
         inferencer: The model.
         dataset: The samples.
         chosen: Indices of the samples to predict.
-        stack: Stack that closes the files at its end.
+        stack: Stack that closes the files when it is closed.
+
+    Returns:
+        The priors in the order of the files; empty without ``--prior``.
     """
     if not args.prior:
         return []
@@ -450,12 +455,12 @@ def save_priors(args: argparse.Namespace, priors: Sequence["AnyPrior"]) -> None:
 
 
 def place_of(dataset: "VectorizedMapDataset", chosen: Sequence[int], path: Path) -> str:
-    """Name of the place of samples, or of the file if it is not known.
+    """Name of the place of samples; the file name without suffix if the place is unknown.
 
     Args:
         dataset: The samples.
         chosen: Indices of the samples to predict.
-        path: File of the prior.
+        path: File of a prior.
 
     Raises:
         ValueError: If the file does not exist and the samples are in several places.
@@ -481,7 +486,7 @@ def draw(
     Args:
         args: The options of the command.
         inferencer: The model.
-        dataset: The samples, which have the LiDAR sweeps of ``--lidar``.
+        dataset: The samples, from which the LiDAR sweeps of ``--lidar`` are read.
         sample: The prediction.
     """
     token = str(sample.metainfo["token"])
@@ -523,8 +528,9 @@ def main(argv: list[str] | None = None) -> str | None:
     chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))
     settings = run_settings(args)
     samples_digest = digest(dataset.annotations.path)
-    # The log of an earlier run is used only if the settings and the input are equal. The name of
-    # the folder of images depends on their content and on the calibration.
+    # The log of an earlier run is used only if the settings and the input are equal. The data root
+    # is included because the name of a folder of extracted images depends on their content and on
+    # the calibration.
     log_settings = {**settings, "input": str(args.input.resolve()), "samples": samples_digest}
     log_settings["images"] = str(source.data_root)
     chosen_tokens = [tokens[index] for index in chosen]
@@ -571,7 +577,7 @@ def print_summary(
     Args:
         args: The options of the command.
         source: The recording.
-        ann_file: Annotation file of the samples, which is copied beside ``--out``.
+        ann_file: Annotation file of the samples, which is copied to a file beside ``--out``.
         count: Number of samples of the run.
         broken: Reasons of broken frames, by token.
     """

@@ -23,10 +23,10 @@ from gsmap.utils.words import format_count
 
 
 def merge_matches(path: Path, shards: list[ShardFile]) -> int:
-    """Write and print the figures of all shards.
+    """Compute the metrics of all shards together, write them to a file and print them.
 
     Returns:
-        The number of samples.
+        The number of samples of all shards.
     """
     reports, notes = report_shards(shards)
     for report in reports:

@@ -65,7 +65,8 @@ def parse_args() -> argparse.Namespace:
 def add_corruption(settings: Any, kind: str, severity: int, seed: int) -> dict[str, Any]:
     """Settings of a data set with a corruption in its pipeline.
 
-    A delay of cameras comes before the loading of images, other corruptions come after it.
+    The delay of cameras is inserted before the step that loads the images, and other corruptions
+    after it.
 
     Args:
         settings: Settings of the data set in a config.
@@ -121,7 +122,13 @@ def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[s
 
 
 def mean_aps(figures: dict[str, list[dict[str, float]]], kind: str) -> list[float]:
-    """Mean AP at each severity of a corruption, in percent."""
+    """Mean AP at each severity of a corruption, in percent.
+
+    Args:
+        figures: AP of each class, and ``mean``, at each severity, by corruption (``KINDS`` or
+            ``CLEAN``).
+        kind: The corruption.
+    """
     return [at_severity["mean"] for at_severity in figures[kind]]
 
 
@@ -180,8 +187,8 @@ def other_figures(
 
     Args:
         earlier: All figures of the earlier run.
-        clean: Figures of this run without corruption. Equal figures show that both runs are of one
-            model and of equal samples.
+        clean: Figures of this run without corruption. If they equal the earlier ones, both runs are
+            taken to have one model and equal samples.
         args: The options of the command.
 
     Raises:
@@ -198,7 +205,7 @@ def other_figures(
 
 
 def require_own_split(checkpoint: Path, settings: Any) -> None:
-    """Refuse a data set if its split list is not the list that the model was trained on."""
+    """Raise an error if the model was trained on another split list than the data set has."""
     from gsmap.checkpoints.reading import read_checked
 
     meta = AnnotationFile(Path(settings["data_root"], settings["ann_file"])).meta

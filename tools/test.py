@@ -73,7 +73,7 @@ def parse_args() -> argparse.Namespace:
 
 
 def apply_options(cfg: Config, args: argparse.Namespace) -> None:
-    """Apply the options of this command to the config."""
+    """Apply the options of this command to the config, in place."""
     cfg.resume = False
     map_metric = {
         "type": "MapMetric",

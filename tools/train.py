@@ -53,7 +53,7 @@ def parse_args() -> argparse.Namespace:
 
 
 def choose_start(cfg: Config, resume: str | None) -> None:
-    """Set and check the checkpoint that the run resumes, or whose weights it starts from."""
+    """Set and check the checkpoint from which the run resumes or takes its initial weights."""
     from gsmap.checkpoints.reading import read_weights
     from gsmap.engine.launch import newest_checkpoint
 

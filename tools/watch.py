@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Start TensorBoard with its own options: ``python tools/watch.py --logdir work_dirs``.
+"""Start TensorBoard with TensorBoard's options: ``python tools/watch.py --logdir work_dirs``.
 
-Plugins of other packages are left out. The plugin of open3d, which mmdet3d installs, stops the
-usual command on machines without libusb.
+Plugins of other packages are left out. The plugin of open3d, which mmdet3d installs, makes the
+usual command ``tensorboard`` fail on machines without libusb.
 """
 
 # Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from

@@ -26,7 +26,7 @@ _MESSAGE_LENGTH = 200  # largest number of characters of a failed run's error
 
 
 def devices() -> list[str | None]:
-    """Values of ``CUDA_VISIBLE_DEVICES`` that select single GPUs; without a GPU, one None (CPU)."""
+    """Values of ``CUDA_VISIBLE_DEVICES`` that select one GPU each, or [None] without a GPU."""
     count = torch.cuda.device_count()
     if not count:
         return [None]
@@ -37,7 +37,7 @@ def devices() -> list[str | None]:
 
 
 def machine() -> str:
-    """Number and name of the GPUs; without a GPU, of the processor cores."""
+    """Number and name of the GPUs, or of the processor cores if there is no GPU."""
     if torch.cuda.is_available():
         return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name()}"
     model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
@@ -48,8 +48,8 @@ def machine() -> str:
 class Job:
     """Training and test of one run on one device.
 
-    The training and the test are the two stages of a job. Each is a child process, which the
-    system ends together with this process.
+    The training and the test are the two stages of a job. Each stage runs in a child process, which
+    the operating system ends if this process ends.
 
     Args:
         run: The run. Its folder is locked until the end of the job.

@@ -1,7 +1,8 @@
 """Runs of several configs and seeds, planned and checked before anything trains.
 
-Each run is a work folder of ``tools/train.py`` with its test in it. The folder holds the whole
-state of a run, so a comparison that was killed continues when its command is given again.
+Each run has a work folder of ``tools/train.py``, which also contains the test of the trained model.
+The folder contains the whole state of a run, so a comparison that was killed continues when its
+command is given again.
 """
 
 import math
@@ -66,8 +67,8 @@ def parse_entry(text: str) -> Entry:
     Raises:
         ValueError: If the name is not valid for a folder, or an override has no value.
     """
-    # Split at commas outside of brackets. A comma is inside of brackets, and no place to split, if
-    # the next bracket after it is a closing one.
+    # Split at commas outside of brackets. A comma is inside of brackets if the next bracket after
+    # it is a closing one.
     first, *options = re.split(r",(?![^\[(]*[\])])", text)
     name, separator, config = first.rpartition("=")
     if not separator:
@@ -167,10 +168,10 @@ class Protocol:
     """Settings of all runs of a comparison.
 
     Attributes:
-        seeds: Number of seeds, from 0 on.
+        seeds: Number of seeds; the seeds are 0, 1, 2 and so on.
         budget: Optimizer steps of each run.
         out: Folder of all work folders.
-        batch: Samples of a step, over all processes.
+        batch: Number of samples of a step, over all processes.
         init: Checkpoint or named model at the start of all runs; None trains from scratch.
         options: Overrides of every config.
     """
@@ -186,9 +187,10 @@ class Protocol:
 def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     """Plan all runs and check them, before anything trains.
 
-    On a GPU a run has one process. On a CPU it has as many processes as earlier runs of the
-    comparison, or else at most one per core. The number of processes divides the batch. It affects
-    the results, as batch normalization uses the samples of one process.
+    On a GPU, a run has one process. On a CPU, it has as many processes as earlier runs of the
+    comparison or, without earlier runs, at most one per core. The batch is divided evenly among the
+    processes. Their number affects the results, because batch normalization uses the samples of one
+    process only.
 
     Args:
         entries: The configs with their overrides.
@@ -246,7 +248,7 @@ def _processes(protocol: Protocol) -> int:
 
 
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
-    """Plan one run; build its data set and its model once, so that faults are found early."""
+    """Plan one run. Its data set and its model are built once, so that faults are found early."""
     initial_weights = None
     own_options = [  # overrides of the comparison; overrides of the user take precedence
         f"train_dataloader.batch_size={protocol.batch // processes}",
@@ -309,7 +311,7 @@ def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int)
         num_samples = len(DATASETS.build(cfg.train_dataloader.dataset))
     samples_per_process = math.ceil(num_samples / processes)
     steps_per_epoch = math.ceil(samples_per_process / cfg.train_dataloader.batch_size)
-    epochs = round(protocol.budget / steps_per_epoch) or 1
+    epochs = round(protocol.budget / steps_per_epoch) or 1  # at least 1
     if epochs * steps_per_epoch != protocol.budget:
         raise InputError(
             f"a budget of {protocol.budget} iterations is no whole number of epochs of {entry.name}"
@@ -347,7 +349,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
 
 
 def _check_folder(run: Run) -> None:
-    """Refuse a work folder of another run."""
+    """Raise an InputError if the work folder belongs to another run or has other content."""
     path = run.folder / SETTINGS
     if path.is_file():
         _refuse_differences(

@@ -1,4 +1,4 @@
-"""Results of a comparison: figures with standard deviations, differences, costs, curves."""
+"""Results of a comparison of runs: figures (values of metrics), differences, costs and curves."""
 
 import json
 import re
@@ -53,8 +53,8 @@ class Result:
         figures: All figures of the test, by flat key; empty if the run is not done.
         costs: Iterations, million parameters, seconds per step and per tested sample, peak memory
             in MiB, as far as they are known; keys of ``_COSTS``.
-        record: Machine, load and commands; empty if the run was not started by
-            `comparison.jobs.execute`.
+        record: Machine, load and commands of the run; empty if `comparison.jobs.execute` did not
+            start it.
         log: The training log; None if there is none.
     """
 
@@ -94,7 +94,7 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     newest = newest_checkpoint(folder) if figures else None
     if newest:
         costs["million parameters"] = _count_parameters(newest) / 1e6
-    # The last line of the log of a test, which is named by its date, has the mean times per sample.
+    # The log of a test is named by its date. Its last line has the mean times per sample.
     tests = sorted(folder.glob("test/*/[0-9]*.json"))
     if tests:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])
@@ -150,10 +150,10 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _config(folder: Path) -> Fields:
-    """Read the config in the folder of a run as data: a stranger's config must not be run.
+    """Read the config in the folder of a run without running it, as its origin may be unknown.
 
     Raises:
-        ValueError: If there is none, or it has more than assignments of plain values.
+        ValueError: If there is no config, or it has more than assignments of plain values.
     """
     configs = sorted(folder.glob("2*/vis_data/config.py"))
     if not configs:
@@ -221,7 +221,7 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
 
 
 def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
-    """Score the ``results.json`` of a run again, with changed rules if there are any."""
+    """Score the ``results.json`` of a run again, with the changed rules of `evaluator_for`."""
     dataset = _config(result.folder).section("test_dataloader.dataset")
     if "ann_file" not in dataset:
         raise InputError(f"{result.folder}: its config does not name the data of its test.")
@@ -255,7 +255,7 @@ def _finished(results: Sequence[Result]) -> list[Result]:
 
 
 def _cell(values: Sequence[float], factor: float = 1.0, form: str = ".1f") -> str:
-    """Mean and, for several values, standard deviation, as the text of a table's cell."""
+    """Format the mean and, for several values, the standard deviation for a cell of a table."""
     if not values:
         return "-"
     scaled = [factor * value for value in values]
@@ -267,10 +267,11 @@ def _cell(values: Sequence[float], factor: float = 1.0, form: str = ".1f") -> st
 
 
 def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[float]]]:
-    """Differences of each config to the first one, seed by seed.
+    """Differences of the figures between each config and the first one, seed by seed.
 
     Returns:
-        List of the differences, one for each seed, by name of the config and then by figure.
+        Differences by name of the config, then by key of the figure, in one list with an entry per
+        seed.
     """
     done = _finished(results)
     if not done:
@@ -292,11 +293,11 @@ def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[
 
 
 def markdown(results: Sequence[Result], title: str, command: str) -> str:
-    """Tables of a comparison in Markdown: figures, paired differences, costs, runs.
+    """Write the tables of a comparison in Markdown: figures, paired differences, costs, runs.
 
     Args:
-        results: Results of all runs, failed ones included. Differences are taken to the config of
-            the first one.
+        results: Results of all runs, failed ones included. Differences are computed to the config
+            of the first result.
         title: Title of the document.
         command: Command line that made the comparison.
     """
@@ -318,7 +319,8 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         figures.append(row)
         row = [name]
         for key, form in _COSTS.items():
-            row.append(_cell([run.costs[key] for run in done if key in run.costs], form=form))
+            known_costs = [run.costs[key] for run in done if key in run.costs]
+            row.append(_cell(known_costs, form=form))
         costs.append(row)
     changes = []
     for name, differences in differences_to_first(results).items():
@@ -355,7 +357,7 @@ def _run_row(result: Result) -> list[str]:
 
 
 def as_json(results: Sequence[Result], title: str, command: str) -> str:
-    """All figures of a comparison as JSON.
+    """Write all figures of a comparison as JSON text.
 
     Args:
         results: Results of all runs.
@@ -404,7 +406,7 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
             for log in runs:
                 steps, values = log.series(f"{metric}/mAP", validation=True)
                 last = log.train[-1]
-                if "epoch" in last:  # validation counts epochs, which become iterations here
+                if "epoch" in last:  # validation counts epochs: convert them to iterations
                     steps = last["step"] / last["epoch"] * steps
                 panel.plot(steps, 100 * values, ".-", color=colour, label=label)
                 label = None  # one entry of the legend for all seeds
@@ -423,7 +425,7 @@ def apply_rescoring(
 
     Args:
         results: Results of all runs. Their figures are replaced if rules change.
-        changes: Changed rules, see `evaluator_for`.
+        changes: Changed rules, as in `evaluator_for`.
 
     Returns:
         Reports of the first finished run of each config, by name.

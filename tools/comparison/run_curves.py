@@ -19,7 +19,7 @@ from gsmap.utils.files import read_text
 from gsmap.visualization.plots import finish_panel, finish_shares, panel_grid
 from gsmap.visualization.style import RUN_COLOURS, MapStyle
 
-# Keys of records that are no metrics.
+# Keys of records that are not metrics.
 _TIMING = ("data_time", "time", "step", "epoch", "iter", "memory")
 
 
@@ -96,7 +96,7 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
 
     Args:
         path: Work folder of the run, or a ``scalars.json``.
-        name: Name for legends and tables; the folder's by default.
+        name: Name for legends and tables; by default the name of the folder.
 
     Raises:
         FileNotFoundError: If there is no log.
@@ -175,7 +175,10 @@ def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
 
 
 def _finish(ax: Axes, title: str, x_label: str = "iteration") -> None:
-    """Finish a panel: a logarithmic y axis if the values span a decade, the legend beside it."""
+    """Set the y axis, the labels and the legend of a panel.
+
+    The y axis is logarithmic if the values span more than a factor of ten.
+    """
     curves = [np.asarray(line.get_ydata()) for line in ax.lines]
     values = np.concatenate([np.empty(0), *curves])
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
@@ -189,7 +192,10 @@ def _finish(ax: Axes, title: str, x_label: str = "iteration") -> None:
 
 
 def _fill_row(axes: np.ndarray, panels: int) -> None:
-    """Remove unused panels and widen the last used one to the end of its row."""
+    """Remove unused panels, and widen the last used panel to the end of its row.
+
+    ``panels`` is the number of used panels.
+    """
     for panel in axes.ravel()[panels:]:
         panel.remove()
     last = axes.ravel()[panels - 1]
@@ -240,7 +246,7 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
     """Draw precision over recall at the middle threshold: a row per metric, a panel per class.
 
     Args:
-        reports: Reports of one run of each config, one per metric, by the name of the config.
+        reports: For each config by its name, the reports of one run, one report per metric.
     """
     first = next(iter(reports.values()))
     style = MapStyle(tuple(first[0].detections))

@@ -135,7 +135,7 @@ def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> Me
 
 
 def read_resamples(args: argparse.Namespace) -> "Resamples | None":
-    """Read the scenes and create the resamples of them; None if no option needs intervals."""
+    """Create resamples of the scenes of the ground truth; None if no option needs intervals."""
     if args.bootstrap is None and not args.against:
         return None
     from gsmap.evaluation.analysis.bootstrap import Resamples
@@ -153,9 +153,9 @@ def interval_report(
     """Print the interval of every AP, and of its difference from another result file.
 
     Args:
-        evaluation: Reports of the metrics with an AP, and notes, of the result file. The notes of
-            ``others`` are added to these notes.
-        others: Reports of all metrics, and notes, of the file of ``--against``, if it is given.
+        evaluation: Reports of the metrics with an AP, and notes, for the result file. The notes of
+            ``others`` are appended to these notes, in place.
+        others: Reports of all metrics, and notes, for the file of ``--against``, if it is given.
         resamples: The resamples of the scenes.
         args: The options of the command.
 
@@ -179,7 +179,7 @@ def interval_report(
                 figures[f"{key}/{part}"] = value
     if others is not None:
         other_reports, other_notes = others
-        # Like `reports`, only the metrics with an AP.
+        # As in `reports`, only metrics with an AP are compared.
         ranked = [report for report in other_reports if report.detections]
         notes.extend(f"{args.against}: {note}" for note in other_notes)
         differences = ap_differences(reports, ranked, resamples)

@@ -241,7 +241,7 @@ def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace
 
 
 def check_changes(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
-    """Require that changes are scored against true changes, and without other analyses."""
+    """Check that changes are scored against true changes, and without other analyses."""
     is_changes = args.results is not None and args.results.suffix.lower() == CHANGES_SUFFIX
     if is_changes and not args.changes:
         parser.error(f"{args.results} is a file of changes: give the true ones as --changes")
@@ -252,7 +252,7 @@ def check_changes(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
     if args.shard.count:
         parser.error("--changes needs all changes: leave out --shard")
     for name in ("by", "bootstrap", "against", "consistency", "uncertainty", "pr_curves"):
-        if getattr(args, name) not in (None, False):
+        if getattr(args, name) not in (None, False):  # the option was given
             option = "--" + name.replace("_", "-")
             parser.error(f"{option} applies to elements, not to changes: leave it or --changes out")
 
@@ -272,11 +272,11 @@ def check_prior(parser: argparse.ArgumentParser, args: argparse.Namespace) -> No
 
 
 def check_shard(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
-    """Refuse options that need all samples, as ``--shard`` matches only a part of them."""
+    """Refuse options that need all samples, because ``--shard`` matches only a part of them."""
     if not args.out:
         parser.error("--shard needs --out")
     for name in ("pr_curves", "bootstrap", "against", "by", "consistency", "uncertainty"):
-        if getattr(args, name) not in (None, False):
+        if getattr(args, name) not in (None, False):  # the option was given
             option = "--" + name.replace("_", "-")
             parser.error(f"{option} needs all samples: leave out --shard")
 

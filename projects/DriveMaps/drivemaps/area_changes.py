@@ -1,4 +1,4 @@
-"""Changes of the areas of one class."""
+"""Changes of the areas of one class between an old map and new drives."""
 
 from dataclasses import dataclass, field
 
@@ -125,10 +125,10 @@ def _added(
     for one_pass in passes:
         elements = one_pass.elements.select(one_pass.elements.labels == label)
         for line, _, score in elements.rows:
-            # The map of a pass has no heights that would have to be left out (see `_scored_areas`).
+            # The map of a pass is 2D, so there are no heights to leave out as in `_scored_areas`.
             for area in _polygons([line]):
                 outline = _outline(area)
-                # The old map says nothing about ground far from all of its elements.
+                # The old map gives no information about ground far from all of its elements.
                 if _overlaps(area, known_areas) or not on_known_ground(outline, old).any():
                     continue
                 in_view = _passes_in_view(outline, passes)
@@ -137,8 +137,8 @@ def _added(
                 is_present = 2 * num_seen > in_view.sum()  # in more than half of the passes
                 if not is_present:
                     continue
-                # Frames of all passes that have a point of the outline in range, as the mean over
-                # the points.
+                # Number of frames of all passes that have a point of the outline in range, as the
+                # mean over the points.
                 views_of_points = views_of_passes(outline, passes).sum(axis=0)  # (n,)
                 views = float(views_of_points.mean())
                 # The score stands for the share of the frames that support the area.
@@ -212,7 +212,7 @@ def _shared_shares(area: shapely.Polygon, others: list[shapely.Polygon]) -> Floa
 def _largest_overlap(
     area: shapely.Polygon, areas_of_passes: list[list[shapely.Polygon]]
 ) -> shapely.Polygon | None:
-    """Area of the passes that overlaps most with an area; None if all are other objects."""
+    """Find the new area that overlaps most with an area; None if all are different objects."""
     best = None
     largest_share = _MIN_OVERLAP
     for areas in areas_of_passes:
@@ -273,7 +273,7 @@ class _Matches:
 def _views_of(
     outline: FloatArray, area: shapely.Polygon, detections: list[_Detections]
 ) -> tuple[int, _Matches]:
-    """Count the frames that have a whole area in range, and find their detections of it.
+    """Count the frames that have a whole area in range, and find the area's detections in them.
 
     Args:
         outline: Points of the outline. (n, 2)
@@ -307,5 +307,5 @@ def _shift_of(area: shapely.Polygon, matches: _Matches) -> Shift:
     weights = np.array(matches.scores) / variances
     mean = weights @ shifts / weights.sum()  # (2,)
     direction = mean / max(float(np.linalg.norm(mean)), 1e-9)
-    # Only the part of each shift along the direction of the mean shift counts as its distance.
+    # The distance of each shift is its component along the direction of the mean shift.
     return Shift.of_frames(shifts @ direction, variances=variances, weights=weights)

@@ -11,19 +11,20 @@ from drivemaps.truth import components, polygons_of
 from gsmap.structures.elements import FloatArray, IntArray
 
 _MAJORITY = 0.5  # share of the votes above which a spot belongs to an area
-# Two detections are of one object if they share at least this part of the smaller one.
+# Two detections show one object if they overlap in at least this share of the smaller one.
 _MIN_OVERLAP = 0.3
-_SIMPLIFY_M = 0.15  # tolerance of simplification: outlines follow the edges of several frames
+# Tolerance of the simplification of outlines, which follow the edges of several frames.
+_SIMPLIFY_M = 0.15
 
 
 def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[FloatArray, float]]:
     """Merge the rings of one class.
 
-    Rings of different frames that overlap are detections of one object. A spot of ground belongs
-    to the object by a vote of the frames that detected it and have the spot in their range,
-    weighted by score over variance. The confidence at a spot is the sum of the scores of the
-    frames whose ring contains it, divided by the number of frames that have it in their range, and
-    at most 1.
+    Rings of different frames that overlap are detections of one object. Whether a spot of ground
+    belongs to the object is decided by vote. The voters are the frames that detected the object
+    and have the spot in their range. A vote is weighted by score over variance. The confidence at a
+    spot is the sum of the scores of the frames whose ring contains the spot, divided by the number
+    of frames that have it in their range. It is limited to 1.
 
     Args:
         drive: Frames with their predictions.
@@ -31,8 +32,8 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
         config: Parameters of merging.
 
     Returns:
-        Closed ring in metres in the global frame, (n, 2), and mean confidence in [0, 1] of each
-        area.
+        For each area, a closed ring in metres in the global frame, (n, 2), and its mean confidence
+        in [0, 1].
     """
     # Each list has one entry for each detection.
     areas: list[shapely.Geometry] = []
@@ -74,11 +75,11 @@ def _group_by_overlap(areas: np.ndarray, frames: IntArray) -> list[IntArray]:
 
     Args:
         areas: Detections of all frames. (A,)
-        frames: Index of the frame of each detection. Two detections of one frame are not joined
-            directly. (A,)
+        frames: Index of the frame of each detection. Two detections of one frame are grouped only
+            through detections of other frames. (A,)
 
     Returns:
-        Indices of the detections of each group. each (n,)
+        Indices of the detections of each group. (n,) each
     """
     first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
     differ = frames[first] != frames[second]
@@ -107,7 +108,7 @@ def _vote(
         weights: Score over mean variance of each detection, in 1 / m^2. (A,)
 
     Returns:
-        Closed ring (n, 2) and mean confidence of each connected part.
+        For each connected part, a closed ring in metres, (n, 2), and its mean confidence in [0, 1].
     """
     rows_of_frame: defaultdict[int, list[int]] = defaultdict(list)
     for row, frame_index in enumerate(frames.tolist()):
@@ -116,7 +117,8 @@ def _vote(
     for frame_index in rows_of_frame:
         footprints[frame_index] = drive.footprint(drive.frames[frame_index])
     edges = shapely.boundary([*areas, *footprints.values()])
-    # The votes are constant between the edges, so one spot per face is enough.
+    # The edges divide the ground into faces. The votes are constant on each face, so they are
+    # counted at one spot per face.
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(edges)]))
     spots = shapely.get_coordinates(shapely.point_on_surface(faces))  # (faces, 2)
     x, y = spots.T
@@ -130,7 +132,7 @@ def _vote(
         votes += weight * contains.any(axis=0)
         all_votes += weight * shapely.contains_xy(footprints[frame_index], x, y)
         support += (scores[rows][:, None] * contains).max(axis=0)
-    # A detection may reach out of the range of its frame, where `votes` exceeds `all_votes`.
+    # A detection may extend beyond the range of its frame. There, `votes` can exceed `all_votes`.
     is_chosen = votes > _MAJORITY * np.maximum(all_votes, votes)
     num_frames = drive.count_frames_in_range(spots)
     confidence = np.minimum(support / np.maximum(num_frames, 1), 1.0)

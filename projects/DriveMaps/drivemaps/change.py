@@ -27,8 +27,8 @@ class Pass:
     """A drive past a place.
 
     Args:
-        drive: Frames with their predictions.
-        elements: Map of the drive in the global frame.
+        drive: Frames of the drive with their predictions.
+        elements: Map made from the drive, in metres in the global frame.
     """
 
     drive: Drive
@@ -46,8 +46,8 @@ class Change:
             position in the old map, and others have their new position. (n, 2)
         confidence: Confidence in [0, 1].
         passes_in_view: Number of passes that have the element in view.
-        num_passes: Number of these passes that agree on the change: they do not see a removed
-            element, or see an added or moved one.
+        num_passes: Number of these passes that agree with the change: they do not detect a removed
+            element, or they detect an added or moved one.
         moved_m: Distance in metres by which a moved element moved, across a line or between the
             centres of an area; None for other kinds.
         moved_std_m: Standard error of this distance in metres; None for other kinds.
@@ -70,7 +70,7 @@ class Changes:
     Args:
         changes: The changes, sorted by class and then by kind.
         num_on_new_ground: Number of elements of the passes on ground that the old map does not
-            cover, by class. They are no changes.
+            cover, by class. They do not count as changes.
         num_not_in_view: Number of elements of the old map without a vertex in view of any pass, by
             class.
     """
@@ -82,13 +82,13 @@ class Changes:
 
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """Mean distance between new and old positions.
+    """Mean distance between the new and the old position of an element.
 
     Args:
         mean_m: Mean over the frames, weighted by score over variance, in metres.
-        std_m: Standard error of the mean in metres. It is the larger one of two estimates, from
-            the variances of the frames and from the scatter of their distances. Both treat frames
-            as independent.
+        std_m: Standard error of the mean in metres: the larger one of two estimates, one from the
+            variances of the frames, one from the scatter of their distances. Both estimates treat
+            frames as independent.
     """
 
     mean_m: float
@@ -113,11 +113,11 @@ class Shift:
         return cls(mean_m, std_m=max(by_variances, by_scatter) ** 0.5)
 
     def exceeds(self, smallest_m: float) -> bool:
-        """Whether the shift is at least a distance, and at least five standard errors."""
+        """Whether the shift is at least ``smallest_m`` and at least five standard errors."""
         return abs(self.mean_m) >= max(smallest_m, _MIN_SIGMAS * self.std_m)
 
     def probability(self, smallest_m: float) -> float:
-        """Probability that the shift exceeds a distance.
+        """Probability that the shift exceeds ``smallest_m``.
 
         The errors of the shift and of the old map are taken to be normally distributed.
         """
@@ -128,7 +128,7 @@ class Shift:
 def smooth_share(support: float, views: float) -> float:
     """Share of the frames that support a change, as if two more frames were against it.
 
-    So the share is low if few frames have the element in view.
+    The two frames keep the share low if few frames have the element in view.
 
     Args:
         support: Number of frames that support the change. A frame may count in part, by a score.
@@ -169,7 +169,7 @@ def near_lines(points: FloatArray, lines: list[FloatArray], within_m: float) -> 
     if shapes and len(points):
         tree = shapely.STRtree(shapes)
         pairs = tree.query(shapely.points(points), predicate="dwithin", distance=within_m)
-        point_indices, _ = pairs
+        point_indices, _ = pairs  # rows: indices of points, indices of shapes
         is_near[point_indices] = True
     return is_near
 

@@ -1,9 +1,9 @@
-"""Search for the changes of a place since an old map was made, and their GeoJSON file.
+"""Search for the changes of a place since an old map was made, and a GeoJSON file of them.
 
-The place is compared with later drives, which are called passes. A point is in view of a pass if
-at least five frames of the drive have it in range. A pass sees an element of the old map if the map
-of its drive has an element of this class there. A change is reported if three quarters of the
-passes that have it in view agree on it.
+The old map is compared with the maps of later drives, which are called passes. A point is in view
+of a pass if it is in range in at least five frames of the drive. A pass confirms an element if the
+map of its drive has an element of this class there. A change is reported if at least three quarters
+of the passes that have it in view agree on it.
 """
 
 from collections import Counter
@@ -35,8 +35,8 @@ from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
 _MIN_SHARE = 0.75  # share of the passes in view that must agree on a change
-# Elements of the old map this far outside of the range of the frames still show which ground the
-# old map covers.
+# Elements of the old map up to this distance outside of the range of the frames are kept, because
+# they show which ground the old map covers.
 _MARGIN_M = 60.0
 
 
@@ -48,11 +48,11 @@ def find_changes(
     A change concerns a whole area, a whole line, or a part of a line that is at least 8 m long.
 
     * Removed: an area or a part of a line of the old map that three quarters
-      of the passes in view do not see.
+      of the passes in view do not confirm.
     * Added: an area or a part of a line in the map of a pass that the old map does not have. The
       old map has no line of the class within 1.5 m of it, or no area of the class that shares 30
-      percent with it. An element of any class of the old map must lie within 30 m, for elsewhere
-      the old map may not cover the ground.
+      percent with it. An element of any class of the old map must lie within 30 m, because
+      elsewhere the old map may not cover the ground.
     * Moved: a part of a line of the old map beside which the maps of the passes have a line, on one
       side and at a mean distance of at least 0.5 m, or an area of the old map whose centre moved by
       at least 0.75 m. The shift must also be at least five standard errors.
@@ -61,12 +61,12 @@ def find_changes(
     show that a line of a pass is not new. Lines of a pass with a score below 0.6 are never reported
     as added, but they show that a line of the old map is still there.
 
-    The confidence of a removed or moved element is multiplied by its score in the old map, as an
-    element that never was there cannot be removed.
+    The confidence of a removed or moved element is multiplied by its score in the old map, because
+    an element that was never there cannot have been removed.
 
     Args:
         old: Old map in the global frame.
-        passes: Drives past the place with their maps, with equal classes.
+        passes: Drives past the place, each with its map. All maps must have equal classes.
         config: Parameters of merging; ``MergeConfig()`` by default.
 
     Returns:
@@ -93,7 +93,7 @@ def find_changes(
             if not on_known_ground(line, old).any():
                 num_on_new_ground[classes[label]] += 1
     num_not_in_view: Counter[str] = Counter()
-    # For each vertex, the number of frames that have it in range, in the pass with the most. (M,)
+    # Number of frames that have a vertex in range, in the pass with the most such frames. (M,)
     most_views = views_of_passes(whole_map.points[:, :2], passes).max(axis=0)
     for index, label in enumerate(whole_map.labels.tolist()):
         vertices = slice(whole_map.offsets[index], whole_map.offsets[index + 1])
@@ -106,7 +106,8 @@ def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
     """Select the elements of an old map near the drives.
 
     Raises:
-        ValueError: If their lines are too long in all, as they are sampled every metre later.
+        ValueError: If the total length of their lines is too large. The lines are later sampled
+            every metre.
     """
     origins = []
     reach_m = 0.0
@@ -122,9 +123,10 @@ def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
         if not len(line):
             continue
         points = line[:, :2]
+        # The bounding box of the line overlaps the box of the drives if both are true.
         starts_before = bool((points.min(axis=0) <= high).all())
         ends_behind = bool((points.max(axis=0) >= low).all())
-        if starts_before and ends_behind:  # its bounding box overlaps the box of the drives
+        if starts_before and ends_behind:
             is_near[index] = True
             total_m += float(arc_lengths(points)[-1])
     if total_m > MAX_TOTAL_LENGTH_M:
@@ -142,12 +144,13 @@ def write_changes(
     place: str,
     origin: MapOrigin | MapGrid | None = None,
 ) -> None:
-    """Write changes as GeoJSON, a feature each.
+    """Write changes to a GeoJSON file, with one feature per change.
 
     The properties of a feature are ``class``, ``change`` (``removed``, ``added`` or ``moved``),
-    ``map``, ``confidence`` and ``passes_in_view``. Among the passes in view, ``passes_not_seen`` is
-    the number that do not see a removed element, and ``passes_seen`` the number that see an added
-    or moved one. Moved elements also have ``moved_m`` and its standard error ``moved_std_m``.
+    ``map``, ``confidence`` and ``passes_in_view``. A removed element also has ``passes_not_seen``,
+    the number of passes in view that do not confirm it. An added or moved element has
+    ``passes_seen``, the number of passes in view that confirm the change. Moved elements also have
+    ``moved_m``, the distance in metres, and its standard error ``moved_std_m``.
 
     Args:
         path: File to write.

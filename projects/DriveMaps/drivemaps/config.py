@@ -32,14 +32,14 @@ class MergeConfig:
     def variances(self, frame: DriveFrame) -> FloatArray:
         """Compute the variance of each predicted vertex across its line.
 
-        It is the variance of the vertex's Gaussian across the line, or a constant without
-        Gaussians, plus a part that grows with the distance from the vehicle.
+        It is the sum of two terms: the variance of the vertex's Gaussian across the line (a
+        constant without Gaussians), and a term that grows with the distance from the vehicle.
 
         Args:
             frame: Frame with its predictions.
 
         Returns:
-            Variances in square metres. (M,)
+            Variance of each of the M vertices, in square metres. (M,)
         """
         elements = frame.elements
         # The vertices are in the global frame. Their distance from the vehicle is their distance

@@ -1,4 +1,4 @@
-"""Directions of lines, and distances to the lines beside them."""
+"""Directions of lines, and distances from a line to the borders beside it."""
 
 import numpy as np
 import shapely
@@ -15,7 +15,7 @@ def rotate_to_left(directions: FloatArray) -> FloatArray:
 
 
 def drop_repeats(line: FloatArray) -> FloatArray:
-    """Drop vertices that equal their predecessor, where a line has no direction. (n, 2)"""
+    """Drop vertices that equal their predecessor, since the line has no direction there. (n, 2)"""
     differs = (np.diff(line, axis=0) != 0).any(axis=1)
     return line[np.append(True, differs)]
 
@@ -50,7 +50,7 @@ def border_distances(
     Args:
         line: Line in its direction, in metres. (n, 2)
         side: 1 for the left side, -1 for the right side.
-        borders: Dividers and boundaries (`border_tree`).
+        borders: Spatial index of dividers and boundaries, from `border_tree`.
         reach_m: Distance up to which borders are searched, at a right angle to the line.
 
     Returns:

@@ -41,8 +41,8 @@ class DriveFrame:
     @property
     def rotation(self) -> FloatArray:
         """Rotation by yaw from the annotation frame to the global frame. (2, 2)"""
-        # The first column of the transform is the x axis of the frame. A vehicle that is tilted
-        # has an axis that is shorter than 1 in the plane.
+        # The first column of the transform is the x axis of the frame. Its projection to the plane
+        # is shorter than 1 if the vehicle is tilted.
         cos, sin = self.sample.global_from_frame[:2, 0]
         return np.array([[cos, -sin], [sin, cos]]) / np.hypot(cos, sin)
 
@@ -119,7 +119,7 @@ class Drive:
         return float(np.hypot(farthest_x, farthest_y)) + _SLACK_M
 
     def count_frames_in_range(self, points: FloatArray) -> IntArray:
-        """Count the frames that have each point in their range.
+        """Count, for each point, the frames whose range contains it.
 
         Args:
             points: Points in metres in the global frame. (M, 2)
@@ -177,8 +177,8 @@ def read_drive(
 
     Args:
         annotations: Annotation file with the samples of the scenes.
-        scenes: Names of the scenes, which have one global frame.
-        maps: Map of each sample in its annotation frame, by token. Samples without one are left
+        scenes: Names of the scenes, which must share one global frame.
+        maps: Map of each sample in its annotation frame, by token. Samples without a map are left
             out.
         name: Name of the drive; empty for the name of the first scene.
 
@@ -211,7 +211,8 @@ def read_drive(
     frames = []
     for sample in samples:
         elements = maps[sample.token].with_coordinates(2)
-        frames.append(DriveFrame(sample, elements.to_frame(sample.global_from_frame)))
+        global_elements = elements.to_frame(sample.global_from_frame)
+        frames.append(DriveFrame(sample, global_elements))
     meta = annotations.meta
     return Drive(
         name or scenes[0],
@@ -226,7 +227,8 @@ def drive_map(rows: Iterable[tuple[int, FloatArray, float]], scored: bool = True
     """Create the map of a drive: simplify its elements, and sort them.
 
     Args:
-        rows: Label, vertices in metres in the global frame, (n, >= 2), and score of each element.
+        rows: Label, vertices and score of each element. The vertices are in metres in the global
+            frame. (n, >= 2)
         scored: Whether the map keeps the scores.
 
     Returns:

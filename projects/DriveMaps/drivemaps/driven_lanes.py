@@ -1,4 +1,4 @@
-"""Centre lines of the lanes that a vehicle has driven, between dividers and boundaries."""
+"""Centre lines of the lanes that a vehicle has driven, computed from dividers and boundaries."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -18,23 +18,25 @@ from drivemaps.directed_lines import (
 )
 from gsmap.structures.elements import FloatArray, IntArray
 
-_WIDTH_M = (2.0, 5.0)  # smallest and largest width of a lane whose middle is known
+# Smallest and largest width of a lane whose middle is taken as its centre line. The middle of a
+# wider lane is interpolated.
+_WIDTH_M = (2.0, 5.0)
 _MOST_APART_M = 8.0  # largest width of a lane, such as a lane in which cars are parked
-_MOST_GAP_M = 30.0  # largest distance of the positions of successive frames of one track
-_LEAST_STEP_M = 0.5  # a vehicle that moves less stands still
+_MOST_GAP_M = 30.0  # largest distance between successive positions of one track
+_LEAST_STEP_M = 0.5  # a vehicle that moves less between two positions counts as standing
 _MOST_CROSSING_M = 50.0  # longest stretch without borders, such as a junction, between two lanes
-_LANE_CHANGE_M = 1.0  # jump of the middle of the lane between two points
+_LANE_CHANGE_M = 1.0  # the lane changes where its middle moves sideways by more than this in a step
 _FILTER = 5  # points of the median filter along the track
 # Largest distance of a point from a point of an earlier pass through its lane. The points of a pass
 # are at most 2 m apart.
 _REPEAT_M = 1.5
-_MOST_POINTS = 25  # number of points after which a centre line is cut, as the width of lanes varies
+_MOST_POINTS = 25  # a longer centre line is cut, because the width of the lane varies along it
 _LEAST_POINTS = 3  # smallest number of points between two cuts of a centre line
 _MIN_PARALLEL_COSINE = 0.7  # smallest cosine between the directions of two passes through one lane
-# The lane between two points of a track has one of these kinds.
+# Kinds of the lane between two successive points of a track.
 _OUTSIDE = 0  # no lane, such as where the vehicle changes lanes
 _BORDERED = 1  # a lane with a border on each side
-_OPEN = 2  # without borders, between two lanes
+_OPEN = 2  # a stretch without borders that joins two lanes, such as a junction
 
 
 class DrivenLanes(NamedTuple):
@@ -54,19 +56,19 @@ class DrivenLanes(NamedTuple):
 def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLanes:
     """Find the lanes along the track of a vehicle.
 
-    A lane lies between the nearest border on the left and on the right. Its centre line is their
-    middle where they are 2 to 5 m apart. Where they are 5 to 8 m apart, the distance of the centre
-    line from the track is interpolated between the places before and after. A lane begins and ends
-    where the vehicle changes lanes. A stretch of at most 50 m without borders between two lanes,
-    such as a junction, joins them.
+    A lane lies between the nearest border on the left of the vehicle and the nearest one on the
+    right. Where these borders are 2 to 5 m apart, the centre line is in the middle between them.
+    Where they are 5 to 8 m apart, the distance of the centre line from the track is interpolated
+    from the places before and after. A lane begins and ends where the vehicle changes lanes. A
+    stretch of at most 50 m without borders, such as a junction, joins the lanes before and after.
 
     Args:
         positions: Positions of the vehicle in the order of time, in metres. (n, 2)
         borders: Dividers and boundaries, in metres. each (m, 2)
 
     Returns:
-        Centre lines, with a separate line for each stretch with borders and each stretch without
-        borders. A lane that is driven twice has one centre line.
+        The lanes. Stretches with borders and stretches without borders have separate centre lines.
+        A lane that is driven twice has one centre line.
     """
     tree = border_tree(borders)
     lanes = [_lane_along(track, tree) for track in _tracks(positions)]
@@ -115,14 +117,15 @@ def _lane_along(track: FloatArray, borders: shapely.STRtree) -> _Lane:
 
     Args:
         track: Positions of the vehicle in metres. (n >= 2, 2)
-        borders: Dividers and boundaries (`border_tree`).
+        borders: Search tree of the dividers and boundaries, from `border_tree`.
     """
     points = resample(track)
     left_m = border_distances(points, side=1, borders=borders, reach_m=_MOST_APART_M)
     right_m = border_distances(points, side=-1, borders=borders, reach_m=_MOST_APART_M)
-    apart_m = left_m + right_m
+    apart_m = left_m + right_m  # infinite where a border is missing
     is_bordered = (apart_m >= _WIDTH_M[0]) & (apart_m <= _MOST_APART_M)
     known = np.flatnonzero(is_bordered & (apart_m <= _WIDTH_M[1]))
+    # Offsets of the centre line to the left of the track. All other points are interpolated.
     offsets_m = np.zeros(len(points))
     if len(known):
         known_offsets_m = (left_m[known] - right_m[known]) / 2
@@ -133,6 +136,7 @@ def _lane_along(track: FloatArray, borders: shapely.STRtree) -> _Lane:
     steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     kinds = np.where(is_bordered[:-1], _BORDERED, _OPEN)
     kinds[np.abs(np.diff(offsets_m)) > _LANE_CHANGE_M] = _OUTSIDE
+    # Stretches without borders that are long or do not lie between two lanes are no lane.
     for start, stop in _runs(kinds):
         joins_lanes = start > 0 and stop < len(kinds)
         if joins_lanes:
@@ -140,11 +144,12 @@ def _lane_along(track: FloatArray, borders: shapely.STRtree) -> _Lane:
         is_short = steps_m[start:stop].sum() <= _MOST_CROSSING_M
         if kinds[start] == _OPEN and not (joins_lanes and is_short):
             kinds[start:stop] = _OUTSIDE
-    return _Lane(points + offsets_m[:, None] * to_left, steps_m=steps_m, kinds=kinds)
+    centers = points + offsets_m[:, None] * to_left
+    return _Lane(centers, steps_m=steps_m, kinds=kinds)
 
 
 def _tracks(positions: FloatArray) -> list[FloatArray]:
-    """Split positions at large gaps; positions of a standing vehicle are dropped. each (n, 2)"""
+    """Split positions into tracks at large gaps, without positions at a stop. each (n >= 2, 2)"""
     tracks: list[list[FloatArray]] = []
     for position in positions:
         step_m = np.linalg.norm(position - tracks[-1][-1]) if tracks else np.inf
@@ -156,14 +161,14 @@ def _tracks(positions: FloatArray) -> list[FloatArray]:
 
 
 def _earlier_points(lanes: Sequence[_Lane]) -> IntArray:
-    """Points of an earlier pass through a lane.
+    """Find the points at which the vehicle has driven through a lane before.
 
     Args:
         lanes: Lanes in the order in which they were driven.
 
     Returns:
-        Index, among the points of all lanes, of the first point driven at the place and in the
-        direction of each point; -1 if there is none. (points,)
+        For each point of all lanes, the index of the first point that was driven at its place and
+        in its direction; -1 if there was no earlier pass. (points,)
     """
     centers = []
     all_directions = []
@@ -171,7 +176,8 @@ def _earlier_points(lanes: Sequence[_Lane]) -> IntArray:
     for lane in lanes:
         centers.append(lane.centers)
         all_directions.append(line_directions(lane.centers))
-        # A point is in a lane if the step after it is; the last point of a track has no step.
+        # A point is in a lane if the step after it is in a lane. No step follows the last point of
+        # a track.
         in_lane.append(np.append(lane.kinds != _OUTSIDE, False))
     points = np.concatenate(centers)
     directions = np.concatenate(all_directions)
@@ -182,7 +188,7 @@ def _earlier_points(lanes: Sequence[_Lane]) -> IntArray:
         earlier = np.array(neighbours)
         cosines = directions[earlier] @ directions[later]
         is_along = is_in_lane[earlier] & (cosines > _MIN_PARALLEL_COSINE)
-        # The last `_FILTER` points before a point count as the same pass.
+        # The last `_FILTER` points before a point belong to the current pass.
         is_earlier_pass = earlier < later - _FILTER
         earlier = earlier[is_along & is_earlier_pass]
         if len(earlier):
@@ -196,7 +202,7 @@ def _earlier_points(lanes: Sequence[_Lane]) -> IntArray:
 def _join_repeats(
     points: FloatArray, stretches: Sequence[tuple[int, int]], earlier_points: IntArray
 ) -> list[FloatArray]:
-    """Join the ends of stretches to the earlier stretches that they meet.
+    """Build the centre lines of stretches, joined to the earlier stretches that they meet.
 
     Args:
         points: Points of all lanes, in metres. (n, 2)
@@ -204,8 +210,8 @@ def _join_repeats(
         earlier_points: First point driven at the place of each point; -1 if there is none. (n,)
 
     Returns:
-        Centre lines of the stretches, which are divided where another one meets them, and after 25
-        points. each (n, 2)
+        Centre lines. A stretch is cut where another stretch meets it, and after each 25 points.
+        each (n, 2)
     """
     joints = _joints(stretches, earlier_points)
     centerlines = []
@@ -227,15 +233,15 @@ def _join_repeats(
 
 
 def _joints(stretches: Sequence[tuple[int, int]], earlier_points: IntArray) -> dict[int, int]:
-    """Find the ends of stretches that meet an earlier stretch.
+    """Find the ends of stretches that meet an earlier stretch, and the points where they meet it.
 
     Args:
         stretches: Indices of the first and the last point of each stretch.
         earlier_points: First point driven at the place of each point; -1 if there is none. (n,)
 
     Returns:
-        For each of these ends, the point of the earlier stretch that it joins. A point near an end
-        of the earlier stretch is replaced by that end.
+        Point of the earlier stretch, by the point of the end that joins it. A point near an end of
+        the earlier stretch is replaced by this end.
     """
     joints = {}
     ends = [point for stretch in stretches for point in stretch]
@@ -253,6 +259,6 @@ def _joints(stretches: Sequence[tuple[int, int]], earlier_points: IntArray) -> d
 
 
 def _runs(values: IntArray) -> list[tuple[int, int]]:
-    """Start and stop index of each run of equal values."""
+    """Start index and (exclusive) stop index of each run of equal values."""
     changes = np.flatnonzero(np.diff(values)) + 1
     return list(pairwise([0, *changes.tolist(), len(values)]))

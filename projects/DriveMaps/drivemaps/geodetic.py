@@ -41,7 +41,7 @@ class MapOrigin:
 
     @cached_property
     def _projection(self) -> Any:
-        """Projection from degrees to metres; at the origin its coordinates need not be zero."""
+        """Projection from degrees to metres, whose coordinates at the origin may not be zero."""
         create_projection = import_extra("pyproj", "maps").Proj
         if self.utm_zone is not None:
             return create_projection(proj="utm", zone=self.utm_zone, ellps="WGS84")
@@ -140,8 +140,8 @@ class MapGrid:
             where: Name of the file, for the message.
 
         Raises:
-            ValueError: If all coordinates are within 100 km and a position is outside of the area,
-                or if a position has no longitude and latitude.
+            ValueError: If a position has no longitude and latitude, or if it is outside of the area
+                of the grid. The area is not checked if a coordinate is larger than 100 km.
         """
         points = np.asarray(positions)[:, :2]
         system = import_extra("pyproj", "maps").CRS.from_user_input(self.crs)
@@ -149,7 +149,7 @@ class MapGrid:
         is_wrong = ~(np.isfinite(lon_deg) & np.isfinite(lat_deg))
         area = system.area_of_use
         if area is not None and np.abs(points).max(initial=0.0) <= _FARTHEST_M:
-            # A point that has no longitude has an infinite one here, whose remainder is NaN.
+            # pyproj returns infinity for a point without a longitude; its remainder is NaN.
             with np.errstate(invalid="ignore"):
                 from_west_deg = (lon_deg - area.west) % 360.0
             width_deg = (area.east - area.west) % 360.0
@@ -206,7 +206,7 @@ class MapGrid:
 
 
 def _require_degrees(lon_lat: FloatArray, where: str) -> FloatArray:
-    """Require longitudes within 180 and latitudes within 90 degrees. (n, 2)"""
+    """Return the coordinates (n, 2) unless a longitude exceeds 180 or a latitude 90 degrees."""
     longitude_deg, latitude_deg = lon_lat.T
     if not (np.abs(longitude_deg).max() <= 180 and np.abs(latitude_deg).max() <= 90):
         raise InputError(

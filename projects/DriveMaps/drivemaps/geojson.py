@@ -12,8 +12,8 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.utils.files import write_text
 
-# The system of longitude and latitude. RFC 7946 has dropped the member ``crs``, as it allows no
-# other system, but programs still read it.
+# Coordinate reference system of longitude and latitude. RFC 7946 allows no other system and has
+# therefore dropped the member ``crs``, but programs still read it.
 _CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
 
 
@@ -50,8 +50,8 @@ def write_features(
 
     Args:
         path: File to write.
-        features: Vertices in metres in the global frame, (n, >= 2), and properties of each element;
-            ``class`` is its class. Closed elements of area classes become polygons.
+        features: Vertices in metres in the global frame, (n, >= 2), and properties of each element.
+            The property ``class`` is required. Closed elements of area classes become polygons.
         origin: Position of the global frame on the Earth, or None for metres.
 
     Raises:

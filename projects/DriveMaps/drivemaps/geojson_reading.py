@@ -21,7 +21,7 @@ from gsmap.utils.json_items import items_of
 
 _ADVICE = "give a GeoJSON FeatureCollection"
 _KINDS = ("LineString", "MultiLineString", "Polygon", "MultiPolygon")
-# Value for a file without the member `crs`. None is the value of a member that is null.
+# Marks a file without the member `crs`. The value None means that the member is null.
 _NO_CRS = "no crs"
 # Names of the system of longitude and latitude on the WGS 84 ellipsoid end in one of these.
 _DEGREES = ("CRS84", "EPSG:4326", "EPSG::4326")
@@ -36,8 +36,8 @@ def read_geojson(
     """Read a FeatureCollection of lines and polygons.
 
     Coordinates are longitude and latitude (RFC 7946). With ``"crs": null`` they are metres of the
-    global frame. Lines and the outer rings of polygons are used, also if a feature has several of
-    them. Heights are dropped. Features of other kinds are only counted.
+    global frame. Lines and the outer rings of polygons become map elements. A feature can have
+    several lines or polygons. Heights are dropped. Features of other kinds are only counted.
 
     Args:
         path: File, which may be untrusted.
@@ -58,9 +58,9 @@ def read_geojson(
     path = Path(path)
     collector = ElementCollector(path, classes, rule=rule or ClassRule(CLASS_KEY))
     members: dict[str, Any] = {"crs": _NO_CRS}
-    for number, (feature, _) in enumerate(
-        items_of(path, "features", _ADVICE, other_entries=members)
-    ):
+    # Reading the features also fills `members` with the other members of the file.
+    features = items_of(path, "features", _ADVICE, other_entries=members)
+    for number, (feature, _) in enumerate(features):
         try:
             _add_feature(feature, collector)
         except InputError as error:
@@ -126,7 +126,7 @@ def _add_feature(feature: Any, collector: ElementCollector) -> None:
 
 
 def _score_of(properties: Mapping[str, Any]) -> float:
-    """Return the confidence that `write_geojson` writes; 1 for other values of ``score``."""
+    """Return the property ``score`` if it is a number in [0, 1], and 1 otherwise."""
     score = properties.get("score")
     if isinstance(score, bool) or not isinstance(score, (int, float)):
         return 1.0
@@ -144,7 +144,7 @@ def _outer_ring(rings: list[Any]) -> FloatArray:
 
 
 def _list_of(value: Any) -> list[Any]:
-    """Require a list."""
+    """Return the value, which must be a list."""
     if not isinstance(value, list):
         raise InputError("its coordinates are nested differently from its type")
     return value

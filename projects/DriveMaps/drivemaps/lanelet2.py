@@ -32,9 +32,9 @@ def write_lanelet2(
 ) -> None:
     """Write a map for the ``lanelet2`` package.
 
-    Areas become polygons, which do not repeat their first node. Other rings end at the node at
-    which they start. Each node has its position in the global frame, in metres, as ``local_x`` and
-    ``local_y``.
+    Areas become polygons, which do not repeat their first node. Other closed lines repeat it at
+    the end. The tags ``local_x`` and ``local_y`` of a node are its position in the global frame in
+    metres.
 
     Args:
         path: File to write.
@@ -65,7 +65,7 @@ def write_lanelet2(
 
 
 def _add_lanelets(file: "_OSMFile", lanes: LaneGraph, speed_limit_kmh: float) -> None:
-    """Add lanelets. The bounds of successive lanelets have their end nodes in common."""
+    """Add lanelets. The bounds of successive lanelets share their end nodes."""
     tags = {
         "type": "lanelet",
         "subtype": "road",
@@ -117,14 +117,14 @@ class _OSMFile:
     def add_way(self, nodes: Sequence[str], tags: dict[str, str]) -> str:
         """Add a line through nodes, given by their ids, and return its id."""
         way = self._add("way", tags)
-        for index, node in enumerate(nodes):  # nodes are written before the tags
+        for index, node in enumerate(nodes):  # nodes go before the tags
             way.insert(index, ElementTree.Element("nd", ref=node))
         return way.get("id", "")
 
     def add_relation(self, way_of_role: dict[str, str], tags: dict[str, str]) -> None:
         """Add a relation of ways, given by their ids."""
         relation = self._add("relation", tags)
-        for index, (role, way) in enumerate(way_of_role.items()):
+        for index, (role, way) in enumerate(way_of_role.items()):  # members go before the tags
             member = ElementTree.Element("member", type="way", ref=way, role=role)
             relation.insert(index, member)
 

@@ -26,7 +26,7 @@ CLASS_OF_TYPE = {
     "pedestrian_marking": "ped_crossing",
     "stop_line": "stop_line",
 }
-"""Class of the line strings of a Lanelet2 type. A type that is not listed may name a class."""
+"""Class of line strings by their Lanelet2 type. A type not listed is used if it is a class name."""
 _CROSSING = "ped_crossing"
 _BLOCK = 1 << 20  # bytes that are read at once
 _DEEPEST = 20  # largest depth of nested XML elements
@@ -41,8 +41,8 @@ class _Node(NamedTuple):
     """Position of a node.
 
     Attributes:
-        degrees: Longitude and latitude in degrees, or None.
-        local: Position in the global frame in metres, or None.
+        degrees: Longitude and latitude in degrees, or None if the node has none.
+        local: x and y in the global frame in metres, or None if the node has none.
     """
 
     degrees: tuple[float, float] | None
@@ -54,7 +54,7 @@ class _Way(NamedTuple):
 
     Attributes:
         nodes: IDs of its nodes.
-        tags: Untrusted tags.
+        tags: Tags by their keys; untrusted.
     """
 
     nodes: list[str]
@@ -74,7 +74,7 @@ class _Relation(NamedTuple):
 
     Attributes:
         way_of_role: ID of each member that is a way, by its role, such as ``left``.
-        tags: Untrusted tags.
+        tags: Tags by their keys; untrusted.
     """
 
     way_of_role: dict[str, str]
@@ -89,14 +89,14 @@ def read_lanelet2(
 ) -> MapFile:
     """Read the line strings, polygons and crosswalks of a Lanelet2 map.
 
-    A line string gets its class by the tag ``class``, or else by its type (`CLASS_OF_TYPE`). A
+    A line string gets its class from the tag ``class``, or else from its type (`CLASS_OF_TYPE`). A
     lanelet of the subtype ``crosswalk`` is an area of the class ``ped_crossing``. Positions are
     ``local_x`` and ``local_y`` if all used nodes have them, and otherwise longitude and latitude.
     Other line strings and relations are only counted.
 
     Args:
-        path: File, which may be untrusted. A file with a document type is refused, as this is
-            where XML declares entities.
+        path: File, which may be untrusted. A file with a document type declaration is refused,
+            because it could declare XML entities that expand to a very long text.
         classes: Class names in label order.
         origin: Position of the global frame on the Earth, for nodes without local positions.
         rule: Tag that gives a line string its class. Types and crosswalks are then not used.
@@ -115,7 +115,8 @@ def read_lanelet2(
     parser.read()
     collector = ElementCollector(path, classes, rule=rule or ClassRule(CLASS_KEY))
     collector.unused.update(parser.num_deleted)
-    crosswalks = parser.crosswalks() if rule is None and _CROSSING in classes else {}
+    uses_crosswalks = rule is None and _CROSSING in classes
+    crosswalks = parser.crosswalks() if uses_crosswalks else {}
     lines = []
     bounds: set[str] = set()  # IDs of ways that are bounds of crosswalks
     for relation_id, relation in crosswalks.items():
@@ -144,7 +145,7 @@ def read_lanelet2(
 
 
 def _with_class(tags: Mapping[str, str], classes: Sequence[str]) -> dict[str, str]:
-    """Return tags that name a class, found by the Lanelet2 type if the given tags name none."""
+    """Return tags with a class name, taken from the Lanelet2 type if the given tags have none."""
     if tags.get(CLASS_KEY) in classes:
         return dict(tags)
     kind = tags.get("type", "")
@@ -158,7 +159,7 @@ def _with_class(tags: Mapping[str, str], classes: Sequence[str]) -> dict[str, st
 
 
 class _Parser:
-    """Nodes, ways and relations of an OSM file, read in blocks by expat.
+    """Parser of the nodes, ways and relations of an OSM file, which expat reads in blocks.
 
     Args:
         path: File.
@@ -198,7 +199,7 @@ class _Parser:
                 parser.Parse(b"", True)
             except (expat.ExpatError, ValueError, LookupError) as error:
                 # A LookupError is raised for an unknown encoding.
-                if isinstance(error, InputError):  # a ValueError of `_error`, which has the reason
+                if isinstance(error, InputError):  # from `_error`, which gives the reason
                     raise
                 advice = fetch_advice(start[:200], otherwise="give a Lanelet2 map in OSM XML")
                 raise InputError(f"{self._path} is no valid XML ({error}): {advice}.") from error

@@ -1,4 +1,4 @@
-"""Lanelets: lanes with a left and a right bound, from centre lines or the track of a drive."""
+"""Lanelets: lanes with a left and a right bound, made from centre lines or the track of a drive."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -61,7 +61,7 @@ class LaneGraph:
         lanelets: Lanelets, the edges of the graph.
         left: End of the left bounds at each node, in metres. (nodes, 2)
         right: End of the right bounds at each node, in metres. (nodes, 2)
-        source: Origin of the lanelets, for reports: "12 lanelets" is followed by this text.
+        source: Origin of the lanelets, a text that follows "12 lanelets" in reports.
     """
 
     lanelets: Sequence[Lanelet]
@@ -73,9 +73,10 @@ class LaneGraph:
 def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
     """Construct lanelets from the map of a drive.
 
-    The lines of a merged map have no direction of travel. A centre line of the map gets the
-    direction of most of the centre lines in the frames that run along it. In a map without centre
-    lines, lanelets are the lanes that the vehicle has driven (`driven_lanes`).
+    The lines of a map that was merged from frames have no direction of travel, but the centre lines
+    of the frames have one. Each centre line of the map gets the direction of most of the frames'
+    centre lines along it. In a map without centre lines, lanelets are the lanes that the vehicle
+    has driven (`driven_lanes`).
 
     Args:
         drive: Frames with poses, and with centre lines in the direction of travel if there are any.
@@ -110,9 +111,9 @@ def _lines_of_class(drive: Drive, elements: MapElements, name: str) -> list[Floa
 def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray]) -> LaneGraph:
     """Construct lanelets from centre lines.
 
-    A line is split where another one begins or ends on it, and only one of several lines on top of
-    each other is used. A bound is parallel to its centre line, at the median distance of the
-    borders beside it, or at 1.75 m if there is no border beside most of it.
+    A line is split where another line begins or ends on it. If several lines lie on top of each
+    other, only the first is used. A bound is parallel to its centre line. Its distance is the
+    median distance of the borders beside the line, or 1.75 m if most of the line has no border.
 
     Args:
         centerlines: Lines in the direction of travel, in metres. each (n >= 2, 2)
@@ -153,6 +154,7 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
         entry_node = int(nodes.node_of_end[2 * index])
         exit_node = int(nodes.node_of_end[2 * index + 1])
         lane = shapely.LineString(line)
+        # Lanes between two nodes that lie on top of each other are one lane.
         known_lanes = lanes_between.setdefault((entry_node, exit_node), [])
         if any(shapely.hausdorff_distance(lane, known) <= _JOIN_M for known in known_lanes):
             continue
@@ -167,14 +169,19 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
 
 
 class _Nodes:
-    """Nodes of a lane graph: groups of ends of lanes that are near and have about one direction.
+    """Nodes of a lane graph: groups of lane ends that are close together with similar directions.
 
     Args:
         ends: Ends of the centre lines in metres; lane i begins at end 2 i and stops at end
             2 i + 1. (E, 2)
         directions: Unit direction of travel at each end. (E, 2)
-        half_widths_m: Distances of the left and the right bound from the centre line of the lane
-            of each end, in metres. (E, 2)
+        half_widths_m: For each end, the distances in metres of the left and the right bound of its
+            lane from the centre line. (E, 2)
+
+    Attributes:
+        node_of_end: Index of the node of each end. (E,)
+        left: Point of each node at which the left bounds meet, in metres. (nodes, 2)
+        right: Point of each node at which the right bounds meet, in metres. (nodes, 2)
     """
 
     def __init__(self, ends: FloatArray, directions: FloatArray, half_widths_m: FloatArray) -> None:
@@ -277,7 +284,7 @@ def _half_width(line: FloatArray, side: int, borders: shapely.STRtree) -> float:
         borders: Dividers and boundaries.
 
     Returns:
-        Distance in metres, ``HALF_WIDTH_M`` if most vertices have no border beside them.
+        Distance in metres; ``HALF_WIDTH_M`` if most vertices have no border beside them.
     """
     nearest_m = border_distances(line, side, borders=borders, reach_m=_MOST_HALF_WIDTH_M)
     finite_m = nearest_m[np.isfinite(nearest_m)]

@@ -1,4 +1,4 @@
-"""Changes of the lines of one class."""
+"""Changes of the lines of one class between an old map and later drives (passes)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -36,18 +36,20 @@ from gsmap.structures.polylines import arc_lengths
 _MIN_OLD_CONFIDENCE = 0.4  # smallest confidence of an old line that is removed or moved
 _MIN_NEW_CONFIDENCE = 0.6  # smallest confidence of a line that is added
 _MIN_LENGTH_M = 8.0  # shorter changed parts are ignored, unless they are whole lines
-_MIN_MOVE_M = 0.5  # a vertex has moved if it is shifted by at least this
+_MIN_MOVE_M = 0.5  # smallest shift of a vertex that counts as a move
 _MIN_FRAMES = 3  # smallest number of matched frames that can show that a part has moved
 _WINDOW = 5  # number of vertices of the running median along a line
 
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """Views of M vertices by the passes.
+    """Evidence of the passes for and against M vertices.
+
+    A pass detects a vertex if its map has a line of the class near the vertex.
 
     Args:
         views: Number of frames of each pass that have a vertex in range. (passes, M)
-        is_seen: Whether the map of a pass has a line of the class near a vertex. (passes, M)
+        is_seen: Whether a pass detects a vertex. (passes, M)
     """
 
     views: IntArray
@@ -55,7 +57,7 @@ class _Evidence:
 
     @classmethod
     def of_points(cls, points: FloatArray, passes: list[Pass], label: int) -> "_Evidence":
-        """Collect the views of points (M, 2) by the passes, for a class."""
+        """Collect the evidence of the passes for points (M, 2), with the lines of one class."""
         is_seen = []
         for one_pass in passes:
             elements = one_pass.elements
@@ -65,33 +67,34 @@ class _Evidence:
 
     @property
     def is_in_view(self) -> BoolArray:
-        """Whether a vertex is in view of a pass. (passes, M)"""
+        """Whether enough frames of a pass have a vertex in range. (passes, M)"""
         return self.views >= MIN_VIEWS
 
     @property
     def is_missing(self) -> BoolArray:
-        """Whether most passes with a vertex in view do not see it. (M,)"""
+        """Whether most passes with a vertex in view do not detect it. (M,)"""
         num_missing = (self.is_in_view & ~self.is_seen).sum(axis=0)
         return 2 * num_missing > self.is_in_view.sum(axis=0)
 
     @property
     def is_present(self) -> BoolArray:
-        """Whether most passes with a vertex in view see it. (M,)"""
+        """Whether most passes with a vertex in view detect it. (M,)"""
         num_seen = (self.is_in_view & self.is_seen).sum(axis=0)
         return 2 * num_seen > self.is_in_view.sum(axis=0)
 
     def count_passes(self, part: slice, seen: bool) -> tuple[int, int]:
-        """Count the passes that have a part of a line in view, and those that agree on it.
+        """Count the passes that have a part of a line in view, and the agreeing passes among them.
 
-        A pass has the part in view if it has more than half of the vertices in view. It sees the
-        part, or misses it, if it sees or misses more than half of the vertices in view.
+        A pass has the part in view if it has more than half of the part's vertices in view. It
+        detects the part if it detects more than half of the vertices in view, and misses the part
+        if it misses more than half of them.
 
         Args:
-            part: Vertices of the part, n in number.
-            seen: True counts the passes that see the part as agreeing, False those that miss it.
+            part: Slice of the n vertices of the part.
+            seen: If True, passes that detect the part agree. If False, passes that miss it agree.
 
         Returns:
-            Number of passes that have the part in view, and number of these that agree.
+            Number of passes that have the part in view, and number of agreeing passes.
         """
         in_view = self.is_in_view[:, part]  # (passes, n)
         num_in_view = in_view.sum(axis=1)
@@ -107,8 +110,8 @@ def line_changes(
 ) -> list[Change]:
     """Find the changes of the lines of one class.
 
-    A line of low confidence is not reported as a change. It only shows that a line at its place is
-    not new, or has not been removed.
+    A line of low confidence is not reported as a change. Its only use is as evidence that a line
+    near it is not new, or has not been removed.
 
     Args:
         old: Old map in the global frame.
@@ -123,7 +126,7 @@ def line_changes(
     if not len(lines.points):
         return _added(old, passes, label)
     predictions = [dense_predictions(one_pass.drive, label, config) for one_pass in passes]
-    # The old lines come first, so their vertices have the indices up to `num_old`.
+    # The old lines come first, so their vertices have the indices 0 to `num_old` - 1.
     joined = join_lines([lines, *predictions])
     normals = normals_of(joined)
     num_old = len(lines.points)
@@ -138,8 +141,8 @@ def line_changes(
         in_view, num_agreeing = evidence.count_passes(part, seen=False)
         if not num_agreeing:
             continue
-        # This is the mean number of frames that do not show a vertex of the part. A frame with a
-        # match of score s counts as 1 - s frames without the part.
+        # Mean number of frames in which a vertex of the part is not detected. A frame with a match
+        # of score s counts as 1 - s such frames.
         num_without = float((views - support)[part].mean())
         old_score = float(lines.scores[part].mean())
         change = Change(
@@ -151,7 +154,8 @@ def line_changes(
             num_passes=num_agreeing,
         )
         changes.append(change)
-    maps = join_lines([lines, *(dense_elements(one.elements, label) for one in passes)])
+    lines_of_passes = [dense_elements(one_pass.elements, label) for one_pass in passes]
+    maps = join_lines([lines, *lines_of_passes])
     moves = _Moves(
         maps=maps,
         map_matches=match_vertices(maps, normals_of(maps), queries=np.arange(num_old)),
@@ -164,15 +168,15 @@ def line_changes(
 
 @dataclass(frozen=True, eq=False)
 class _Moves:
-    """Distances of new lines from the vertices of old ones, in metres; positive on the left.
+    """Distances of new lines from the vertices of old lines, in metres, positive to the left.
 
-    The positions come from the maps of the passes, which are more accurate than single frames. The
-    errors come from the frames.
+    The distances are measured in the maps of the passes, which are more accurate than single
+    frames. The errors of the distances are estimated from the frames.
 
     Args:
-        maps: Old lines as the first ones, and the lines of the maps of the passes.
+        maps: Old lines, followed by the lines of the maps of the passes.
         map_matches: Matches of the old vertices with the maps, at most one per vertex and pass.
-        frames: Old lines as the first ones, and the predicted lines of all frames.
+        frames: Old lines, followed by the predicted lines of all frames.
         frame_matches: Matches of the old vertices with the predictions.
     """
 
@@ -182,24 +186,27 @@ class _Moves:
     frame_matches: Matches
 
     def shifts(self, num_vertices: int) -> FloatArray:
-        """Mean distance of each old vertex over the passes; 0 without a match. (M,)"""
+        """Mean distance at each old vertex over the passes; 0 without a match. (M,)"""
         matches = self.map_matches
         totals = np.bincount(matches.vertices, matches.distances, minlength=num_vertices)
         counts = np.bincount(matches.vertices, minlength=num_vertices)
         return totals / np.maximum(counts, 1)
 
     def shift_of(self, part: slice) -> Shift | None:
-        """Mean distance of a part of an old line, and its error; None without enough frames."""
-        by_pass = _by_frame(self.maps, _within(self.map_matches, part))  # a map is one frame
+        """Mean distance over a part of an old line, and its error; None if too few frames match."""
+        # `_by_frame` treats the map of a pass as one frame.
+        by_pass = _by_frame(self.maps, _within(self.map_matches, part))
         by_frame = _by_frame(self.frames, _within(self.frame_matches, part))
         if len(by_frame.distances) < _MIN_FRAMES:
             return None
-        error_m = Shift.of_frames(*by_frame).std_m
-        return Shift(float(by_pass.distances.mean()), std_m=error_m)
+        frame_shift = Shift.of_frames(
+            by_frame.distances, variances=by_frame.variances, weights=by_frame.weights
+        )
+        return Shift(float(by_pass.distances.mean()), std_m=frame_shift.std_m)
 
 
 class _FrameDistances(NamedTuple):
-    """Distances of a part of a line in F frames.
+    """Distances of new lines from a part of an old line, in F frames.
 
     Attributes:
         distances: Mean distance in each frame, in metres. (F,)
@@ -214,7 +221,8 @@ class _FrameDistances(NamedTuple):
 
 def _within(matches: Matches, part: slice) -> Matches:
     """Select the matches of the vertices of a part."""
-    return matches.select((matches.vertices >= part.start) & (matches.vertices < part.stop))
+    is_in_part = (matches.vertices >= part.start) & (matches.vertices < part.stop)
+    return matches.select(is_in_part)
 
 
 def _moved(
@@ -223,7 +231,7 @@ def _moved(
     """Find parts of the old lines that moved across their direction.
 
     Args:
-        lines: Old lines. M vertices
+        lines: Old lines, with M vertices in all.
         normals: Unit vector to the left of each vertex of the old lines. (M, 2)
         moves: Distances of the new lines.
         evidence: Views of the vertices of the old lines.
@@ -263,8 +271,9 @@ def _moved(
 
 
 def _by_frame(joined: DenseLines, matches: Matches) -> _FrameDistances:
-    """Mean distance in each frame; a frame counts once, however many vertices match."""
-    # `rows` numbers the frames with matches, and `counts` are their numbers of matches.
+    """Average the matches of each frame that has matches."""
+    # `rows` is the index of each match's frame among these frames, and `counts` is the number of
+    # matches of each of these frames.
     _, rows = np.unique(joined.frames[matches.segments], return_inverse=True)
     counts = np.bincount(rows)
     scores = joined.scores[matches.segments]
@@ -290,7 +299,7 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
             continue
         evidence = _Evidence.of_points(lines.points, passes, label)
         is_new = ~near_lines(lines.points, known_lines, within_m=REACH_M)
-        # The old map says nothing about ground far from all of its elements.
+        # The old map has no information about ground far from all of its elements.
         is_new &= on_known_ground(lines.points, old) & evidence.is_present
         views = evidence.views.sum(axis=0)
         for part in _parts(lines, is_new):
@@ -299,7 +308,7 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
                 continue
             num_views = float(views[part].mean())
             score = float(lines.scores[part].mean())
-            # The score stands for the share of the frames that support the part.
+            # The score is taken as the share of the frames that support the part.
             support = score * num_views
             change = Change(
                 ADDED,
@@ -310,19 +319,24 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
                 num_passes=num_agreeing,
             )
             changes.append(change)
-            known_lines = [*known_lines, change.line]  # so the next passes do not add it again
+            # The line is known from now on, so the next passes do not add it again.
+            known_lines = [*known_lines, change.line]
     return changes
 
 
 def _parts(lines: DenseLines, flags: BoolArray) -> list[slice]:
-    """Find the parts of lines whose vertices have a flag.
+    """Find the parts of lines in which a flag is set.
 
-    A part is at least 8 m long, or a whole line. The flags are smoothed along a line by a running
-    median, so that one or two deviating vertices neither interrupt a part nor make one.
+    A part has at least two vertices, and is at least 8 m long or a whole line. The flags are
+    smoothed along each line by a running median, so that one or two deviating vertices neither
+    split a part nor form one.
 
     Args:
-        lines: Lines. M vertices
+        lines: Lines with M vertices in all.
         flags: Flag of each vertex. (M,)
+
+    Returns:
+        Slice of the vertices of each part.
     """
     parts = []
     for start, end in zip(lines.offsets[:-1].tolist(), lines.offsets[1:].tolist(), strict=True):

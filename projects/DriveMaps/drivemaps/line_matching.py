@@ -1,4 +1,4 @@
-"""Matching of densely sampled lines of several frames across their direction."""
+"""Matching of densely sampled lines of several frames, at a right angle to the lines."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
 REACH_M = 1.5
-"""Largest distance in metres, across a line, of a vertex from its matches."""
+"""Largest distance in metres between a vertex and its match, at a right angle to the line."""
 STEP_M = 1.0
 """Largest distance in metres between the vertices of densely sampled lines."""
 _MAX_TURN_DEG = 30.0  # largest angle between two lines that are matched
@@ -155,11 +155,11 @@ def normals_of(lines: DenseLines) -> FloatArray:
 def match_vertices(
     lines: DenseLines, normals: FloatArray, queries: IntArray | None = None
 ) -> Matches:
-    """Match each vertex, in each other frame, with the nearest line of about the same direction.
+    """Match each vertex with the nearest line of similar direction in each other frame.
 
-    There is no match if the frame of the vertex itself has another line on the side of the match,
-    at less than twice the distance of the match. Lines of one frame belong to different objects, so
-    the match could belong to that other line.
+    A match is rejected if the frame of the vertex has another line on the side of the match, at
+    less than twice the distance of the match. Lines of one frame belong to different objects, so
+    the match could belong to this other line.
 
     Args:
         lines: Lines of all frames.
@@ -180,10 +180,11 @@ def match_vertices(
         queries = np.arange(len(points))
     num_frames = len(np.unique(lines.frames))
     num_pairs_left = max(_MOST_PAIRS, _MOST_PAIRS_PER_FRAME * num_frames * len(points))
-    # The normal of a vertex within reach, on both sides, has a bounding box of twice this size.
+    # The normal of a vertex is searched up to REACH_M on both sides. The bounding box of this
+    # segment extends by ``reach`` to both sides of the vertex. (M, 2)
     reach = np.abs(REACH_M * normals)
     chunks = []
-    for start in range(0, max(len(queries), 1), _CHUNK_SIZE):  # one empty chunk without queries
+    for start in range(0, max(len(queries), 1), _CHUNK_SIZE):  # without queries: one empty chunk
         chunk = queries[start : start + _CHUNK_SIZE]
         boxes = _boxes(points[chunk] - reach[chunk], points[chunk] + reach[chunk])
         positions, segments = tree.query(boxes)
@@ -235,7 +236,7 @@ def _match_pairs(
         segments: Index of the first vertex of the segment of each pair. (pairs,)
 
     Returns:
-        Matches of different lines, also of one frame, in the order of the pairs.
+        Matches between different lines, which may belong to one frame, in the order of the pairs.
     """
     differ = lines.line_indices[vertices] != lines.line_indices[segments]
     vertices = vertices[differ]
@@ -268,7 +269,7 @@ def _select_matches(lines: DenseLines, candidates: Matches) -> Matches:
 
     Args:
         lines: Lines of all frames.
-        candidates: Matches of some vertices, also within one frame.
+        candidates: Matches of some vertices, including matches within one frame.
     """
     vertices = candidates.vertices
     in_one_frame = lines.frames[vertices] == lines.frames[candidates.segments]
@@ -325,7 +326,8 @@ def join_lines(parts: Sequence[DenseLines]) -> DenseLines:
     """Join lines of different frames.
 
     Args:
-        parts: Lines. The frames of a part are numbered on from the frames of the previous part.
+        parts: Groups of lines. The frame indices of each part are shifted, so that they follow the
+            frame indices of the previous part.
     """
     points = [np.zeros((0, 2))]
     frames = [np.zeros(0, np.int64)]

@@ -119,8 +119,8 @@ def _select_parts(
     Returns:
         Vertices of each part; a part lies within one line.
     """
-    # Sort the matches by the line of their segment. Those with line i are then the matches
-    # line_bounds[i]:line_bounds[i + 1].
+    # Sort the matches by the line of their segment. The segments of the matches
+    # line_bounds[i]:line_bounds[i + 1] then belong to line i.
     matched_lines = lines.line_indices[matches.segments]
     matches = matches.select(np.argsort(matched_lines, kind="stable"))
     line_bounds = np.searchsorted(

@@ -1,4 +1,4 @@
-"""Map files of any form, by their suffix."""
+"""Reading of map files, in the format that belongs to their suffix."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,21 +23,21 @@ def read_map(
     origin: MapOrigin | MapGrid | None = None,
     rule: ClassRule | None = None,
 ) -> MapFile:
-    """Read a map, GeoJSON or Lanelet2, of this or of another program.
+    """Read a GeoJSON or Lanelet2 map that this or another program has written.
 
     Args:
         path: File, which may be untrusted: ``.geojson``, ``.json``, ``.osm`` or ``.xml``.
         classes: Class names in label order.
         origin: Position of the global frame on the Earth, for maps in degrees.
-        rule: Property or tag of the class of an element; by default as `read_geojson` and
-            `read_lanelet2` describe.
+        rule: Property or tag that gives an element its class. The default is described in
+            `read_geojson` and `read_lanelet2`.
 
     Returns:
         Elements in the global frame, and the number of elements that are not used.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the suffix is another one, or the file cannot be used.
+        ValueError: If the suffix is not one of these four, or the file cannot be used.
         RuntimeError: If the map is in degrees and ``pyproj`` is missing.
     """
     path = Path(path)

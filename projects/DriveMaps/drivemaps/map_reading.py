@@ -25,7 +25,7 @@ FARTHEST_M = 1e7
 """Largest coordinate of a vertex in metres of the global frame."""
 _MOST_VERTICES = 5_000_000
 _SMALLEST_M2 = 0.01  # a ring with a smaller area is a point or a line and is not used
-_LONGEST_NAME = 60  # characters of a value in a message
+_LONGEST_NAME = 60  # largest number of characters of a value in a message
 _LISTED_REASONS = 8  # largest number of reasons in a message
 
 
@@ -33,8 +33,8 @@ class MapFile(NamedTuple):
     """Map that was read from a file.
 
     Attributes:
-        elements: Elements in metres in the global frame, with labels of the requested classes, and
-            scores, which are 1 if the file has none.
+        elements: Elements in metres in the global frame, labelled by the requested classes. Scores
+            are 1 if the file has none.
         unused: Number of elements of the file that are not used, by the reason.
     """
 
@@ -44,14 +44,14 @@ class MapFile(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassRule:
-    """Rule that gives the elements of a file their class by a property.
+    """Rule that finds the class of an element of a file from one of its properties.
 
     Args:
         key: Name of the property, or of the tag in a Lanelet2 file.
         class_of: Class of each value of the property; None if the values are names of classes.
 
     Raises:
-        ValueError: If the name is empty.
+        ValueError: If ``key`` is empty.
     """
 
     key: str
@@ -71,7 +71,7 @@ class ClassRule:
             classes: Names of the classes.
 
         Raises:
-            ValueError: If a word has another form, or a class does not exist.
+            ValueError: If a word after the first is not ``VALUE=CLASS``, or a class does not exist.
         """
         key, *pairs = words
         class_of = {}
@@ -87,12 +87,12 @@ class ClassRule:
 
 
 class ElementCollector:
-    """Collects the lines of a file that have a class, and counts the other ones.
+    """Collects the lines of a file that have a class, and counts the unused lines by the reason.
 
     Args:
-        path: File, for messages.
+        path: Path of the file, for messages.
         classes: Class names in label order.
-        rule: Rule of the class of an element.
+        rule: Rule that finds the class of an element.
     """
 
     def __init__(self, path: Path, classes: Sequence[str], rule: ClassRule) -> None:
@@ -112,7 +112,7 @@ class ElementCollector:
             values: Untrusted properties of the element.
 
         Returns:
-            Name of the class. None if the rule finds no class; the element is counted as unused.
+            Name of the class. If the rule finds no class, None; the element then counts as unused.
         """
         value = values.get(self._rule.key)
         if isinstance(value, (int, float)):
@@ -127,7 +127,7 @@ class ElementCollector:
         return name
 
     def add(self, name: str, line: FloatArray, score: float = 1.0) -> None:
-        """Add an element, or count it as unused if it has no length or is an area that is open.
+        """Add an element, or count it as unused if it has no length or is an unclosed area.
 
         Args:
             name: Class of the element.
@@ -159,14 +159,15 @@ class ElementCollector:
     def finish(self, origin: MapOrigin | MapGrid | None) -> MapFile:
         """Convert the lines to the global frame, check them, and create the map.
 
-        Areas that enclose no ground are counted as unused.
+        Areas of less than 0.01 square metres are counted as unused.
 
         Args:
             origin: Position of the global frame on the Earth for lines in degrees; None for lines
                 in metres.
 
         Raises:
-            ValueError: If a coordinate is out of range, or elements exist and none can be used.
+            ValueError: If a coordinate is out of range, or the file has elements but none of them
+                can be used.
         """
         if not self._lines and self.unused:
             raise InputError(
@@ -216,10 +217,11 @@ def describe_unused(unused: Counter[str]) -> str:
     Returns:
         Numbers and reasons, the most frequent ones first.
     """
+    listed_reasons = unused.most_common(_LISTED_REASONS)
     parts = []
-    for reason, count in unused.most_common(_LISTED_REASONS):
+    for reason, count in listed_reasons:
         parts.append(f"{count} x {reason}")
-    num_others = unused.total() - sum(count for _, count in unused.most_common(_LISTED_REASONS))
+    num_others = unused.total() - sum(count for _, count in listed_reasons)
     if num_others:
         parts.append(f"{num_others} x other reasons")
     return ", ".join(parts)
@@ -229,7 +231,7 @@ def finite_number(value: Any) -> float:
     """Convert a JSON number to a finite number.
 
     Raises:
-        ValueError: If the value is no finite number.
+        ValueError: If the value is not a finite number. ``True`` and ``False`` are not numbers.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{value!r:.40} is no number")

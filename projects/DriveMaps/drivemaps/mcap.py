@@ -1,4 +1,4 @@
-"""MCAP files of drives and their maps for Foxglove."""
+"""Writing of MCAP files that show drives and their maps in Foxglove."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +25,8 @@ _GROUND = "base_footprint"  # x ahead, y left, on the road
 def write_mcap(path: str | Path, replay: Replay) -> None:
     """Write a drive as an MCAP file (``.mcap``).
 
-    It contains cameras, predictions, their Gaussians as ellipses, and the growing map.
+    The file contains the cameras, the predictions, their Gaussians as ellipses, and the map as it
+    grows from frame to frame.
 
     Args:
         path: File to write.
@@ -147,7 +148,7 @@ class _Log:
         Args:
             topic: Topic of the lines.
             frame: Name of the frame of the vertices.
-            lines: Class index and vertices in metres of each line. (int, (n, 3)) each
+            lines: Class index of each line, and its vertices in metres. (n, 3)
             time_ns: Time in nanoseconds.
         """
         messages = self._messages
@@ -195,7 +196,7 @@ class _Log:
         self._send_entity("/gaussians", _FRAME, time_ns, spheres=spheres)
 
     def _send_entity(self, topic: str, frame: str, time_ns: int, **shapes: Any) -> None:
-        """Log the shapes of a topic, which replace its previous ones."""
+        """Log the shapes of a topic. They replace the previous shapes of the topic."""
         messages = self._messages
         entity = messages.SceneEntity(
             timestamp=self._stamp(time_ns),

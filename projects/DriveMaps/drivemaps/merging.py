@@ -38,8 +38,8 @@ def confident(drive: Drive, min_score: float) -> Drive:
 def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
     """Merge the predictions of all frames into one map, deterministically.
 
-    A model may predict an object of a frame several times. Therefore lines that run along a line of
-    their frame and class with a higher score are not merged. The rule is the one of `suppress`.
+    A model may predict an object of a frame several times. Therefore a line is left out if it runs
+    along a line of its frame and class that has a higher score, as in `suppress`.
 
     Args:
         drive: Frames with their predictions.

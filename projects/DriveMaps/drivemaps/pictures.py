@@ -13,7 +13,7 @@ from gsmap.visualization.style import MapStyle
 
 
 def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyle) -> Figure:
-    """Draw maps of one drive side by side, or wide maps below each other, with the driven track.
+    """Draw maps of one drive with the driven track, side by side or, if they are wide, in a column.
 
     Args:
         maps: Maps in the global frame, by title.
@@ -22,7 +22,7 @@ def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyl
     """
     vertices = [elements.points[:, :2] for elements in maps.values()]
     points = np.concatenate([track, *vertices])
-    low = points.min(axis=0) - 5
+    low = points.min(axis=0) - 5  # a margin of 5 m
     high = points.max(axis=0) + 5
     width, height = high - low
     rows = len(maps) if width > 2.5 * height else 1  # one column or one row of panels

@@ -1,4 +1,4 @@
-"""Drives over time, with heights, for viewers of any format."""
+"""Frames of a drive in order of time, with 3D lines, for the writers of all viewer formats."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ class Moment:
 
     Args:
         frame: Sensors, pose and predictions.
-        lines: Predictions in metres in the annotation frame, on the ground. each (n, 3)
-        map_lines: Part of the map of the drive that has been in range until now: label and
-            vertices in metres in the global frame. each (int, (n, 3))
+        lines: Predicted polylines on the ground, in metres in the annotation frame. (n, 3) each
+        map_lines: Part of the map that has been in the range of a frame so far. Each line is its
+            label and its vertices (n, 3) in metres in the global frame.
     """
 
     frame: DriveFrame
@@ -43,8 +43,8 @@ class Moment:
         if elements.scales is None or elements.rotations is None:
             return None
         centres = np.concatenate([np.zeros((0, 3)), *self.lines])
-        # The elements are in the global frame: their rotations are turned by the yaw of the frame,
-        # and the centres are the vertices in the annotation frame, one Gaussian per vertex.
+        # Each vertex is the centre of one Gaussian. `self.lines` are in the annotation frame, but
+        # `elements.rotations` are in the global frame, so the yaw of the frame is subtracted.
         # A rotation by an angle about z has the quaternion (0, 0, sin(angle / 2), cos(angle / 2)).
         half_angles = (elements.rotations - self.frame.yaw_rad) / 2.0
         quaternions = np.zeros((len(half_angles), 4))
@@ -123,7 +123,7 @@ def _raise_to_ground(
         points: Points (x, y) in metres in the global frame. (n, 2)
         frames: Frames of the drive.
         views: Ground plane of each frame.
-        frame_tree: Origins of the frames in the global frame.
+        frame_tree: Search tree of the origins (x, y) of the frames in the global frame.
 
     Returns:
         Points (x, y, z) in metres in the global frame. (n, 3)

@@ -1,4 +1,4 @@
-"""Scores of maps of drives: AP of elements, completeness and accuracy of lengths."""
+"""Scores of the maps of drives: AP of elements, and completeness and accuracy by length."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,14 +14,14 @@ from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.utils.words import markdown_table
 
 NUM_POINTS = 1000
-"""Number of points to which elements of drives, hundreds of metres long, are resampled."""
+"""Number of points of a resampled element of a drive, which may be hundreds of metres long."""
 _NUM_POINTS_OF_SAMPLES = 100  # number of points for elements within the range of one sample
 
 
 def chamfer_ap(
     pairs: Sequence[tuple[str, MapElements, MapElements]], classes: Sequence[str], num_points: int
 ) -> dict[str, float]:
-    """Compute AP_chamfer per class.
+    """Compute the AP with the Chamfer distance for each class.
 
     Args:
         pairs: Name, predicted map and true map of each drive or sample.
@@ -29,8 +29,8 @@ def chamfer_ap(
         num_points: Number of points that each line is resampled to.
 
     Returns:
-        AP in [0, 1] of each class that has ground truth, and their ``mean``, which is NaN without
-        any ground truth.
+        AP in [0, 1] of each class that has ground truth, and their ``mean``. The mean is NaN if no
+        class has ground truth.
     """
     evaluator = MapEvaluator(ChamferConfig(tuple(classes), num_points=num_points))
     matches = []
@@ -77,7 +77,7 @@ def _linestrings(elements: MapElements, label: int) -> np.ndarray:
 
 
 def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapElements:
-    """Cut the range of a frame out of the map of a drive, by the rules for ground truth.
+    """Cut the range of a frame out of the map of a drive, as it is done for ground truth.
 
     Args:
         elements: Map in the global frame.
@@ -167,7 +167,9 @@ def figures_table(figures: Mapping[str, Mapping[str, Mapping[str, float]]]) -> s
     # The columns are the classes of all figures, in the order in which they first occur.
     columns: list[str] = []
     for values in first_figures.values():
-        columns += [key for key in values if key not in (*columns, "mean")]
+        for key in values:
+            if key != "mean" and key not in columns:
+                columns.append(key)
     columns.append("mean")
     rows = []
     for figure in first_figures:

@@ -11,21 +11,21 @@ from gsmap.structures.polylines import arc_lengths
 
 JOIN_M = 2.0  # largest gap that is closed
 _HEADING_M = 2.0  # the last 2 m of a line define its direction at an end
-_GAP_STEP_M = 0.25  # gaps are rounded to this; the straightest of equal ones is closed first
+_GAP_STEP_M = 0.25  # gaps are rounded to multiples; of equal gaps, the straightest is closed first
 _RING_M = 10.0  # smallest length of a line that is closed to a ring
 
 
 def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
     """Join lines at their ends, the narrowest and straightest gaps first.
 
-    Two ends are joined if they are near, the line turns by less than a right angle there, and
-    neither is joined to another end.
+    Two ends are joined if they are at most 2 m apart, the joined line turns by less than a right
+    angle there, and neither end is joined to another one.
 
     Args:
-        lines: Open lines or rings in metres; columns after (x, y) are carried along. N x (n, D)
+        lines: Open lines or rings in metres. Columns after (x, y) are kept unchanged. N x (n, D)
 
     Returns:
-        Joined lines; the last vertex of a ring equals its first. each (m, D)
+        Joined lines; the last vertex of a ring equals its first. Each (m, D)
     """
     is_closed = [bool(np.array_equal(line[0, :2], line[-1, :2])) for line in lines]
     # End that each joined end is joined to. Line i has the ends 2 * i (first) and 2 * i + 1 (last).
@@ -54,7 +54,7 @@ def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
     ends = []
     headings = []
     for line in lines:
-        for from_end in (line[:, :2], line[::-1, :2]):  # begins at the first end, at the last end
+        for from_end in (line[:, :2], line[::-1, :2]):  # from the first end, from the last end
             end = from_end[0]
             inner = shapely.line_interpolate_point(shapely.LineString(from_end), _HEADING_M)
             heading = end - shapely.get_coordinates(inner)[0]
@@ -69,11 +69,11 @@ def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
     cosine = (outward[first] * outward[second]).sum(axis=1)
     gap = np.linalg.norm(points[first] - points[second], axis=1)
     rounded_gap = np.round(gap / _GAP_STEP_M)
-    # Sort by gap, then by cosine. It is -1 if the outward directions of both ends are opposite, so
-    # that the joined line goes straight on. The indices of the ends come last, for a fixed order.
-    order = np.lexsort((second, first, cosine.round(6), rounded_gap))
-    continues = cosine[order] < 0.0  # turns by less than a right angle
-    return [(int(a), int(b)) for a, b in pairs[order[continues]]]
+    # Sort by gap, then by cosine. The cosine is -1 where the outward directions of both ends are
+    # opposite: the joined line goes straight on. The indices of the ends make the order unique.
+    order = np.lexsort((second, first, cosine.round(6), rounded_gap))  # the last key sorts first
+    is_allowed = cosine[order] < 0.0  # the joined line turns by less than a right angle
+    return [(int(a), int(b)) for a, b in pairs[order[is_allowed]]]
 
 
 def _join_chain(
@@ -83,14 +83,15 @@ def _join_chain(
 
     Args:
         lines: All lines. N x (n, D)
-        partner_of: End that each joined end is joined to; line i has the ends 2 i and 2 i + 1.
+        partner_of: End that each joined end is joined to. Line i has the ends 2 * i and 2 * i + 1.
         index: Index of a line of the chain.
         visited: Indices of the lines in previous chains. This function adds the lines of the chain.
 
     Returns:
         Vertices without successive equal ones. (m, D)
     """
-    entry = 2 * index  # end at which the walk enters a line; the other end is entry ^ 1
+    # Number of the end at which a line is entered. The number of its other end is `entry ^ 1`.
+    entry = 2 * index
     passed = {index}
     # Walk from line to line until an end is not joined, or until all lines of a ring are passed.
     while entry in partner_of and partner_of[entry] // 2 not in passed:
@@ -111,5 +112,5 @@ def _join_chain(
             parts.append(first_vertex)  # closes the ring
             break
     points = np.concatenate(parts)
-    has_moved = (points[1:, :2] != points[:-1, :2]).any(axis=1)
-    return points[np.append(True, has_moved)]
+    differs_from_previous = (points[1:, :2] != points[:-1, :2]).any(axis=1)
+    return points[np.append(True, differs_from_previous)]  # the first vertex is kept

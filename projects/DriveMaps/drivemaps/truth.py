@@ -1,4 +1,4 @@
-"""True maps of drives, put together from the ground truth of their samples."""
+"""True maps of drives, merged from the ground truth of their samples."""
 
 from collections.abc import Sequence
 
@@ -12,17 +12,17 @@ from drivemaps.stitching import stitch
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 
-# Vertices are rounded to this grid, so that a point that two samples have in common becomes equal
-# in both. The rounding errors of the poses are far smaller than the grid.
+# Vertices are rounded to this grid, so that a point of the map has equal coordinates in all samples
+# that contain it. The rounding errors of the poses are far smaller than the grid.
 GRID_M = 0.002
 _OVERLAP_M = 0.2  # pieces that share more length than this belong to one line
 
 
 def true_map(drive: Drive) -> MapElements:
-    """Put the ground truth of the samples of a drive together.
+    """Merge the ground truth of the samples of a drive to one map.
 
-    The samples are cut out of one map. Pieces that run along each other belong to one line, and
-    areas that overlap belong to one area.
+    The ground truth of each sample is a cut-out of one map. Pieces that run along each other are
+    united to one line, and overlapping areas to one area.
 
     Args:
         drive: Frames with their ground truth.
@@ -55,7 +55,7 @@ def components(count: int, first: IntArray, second: IntArray) -> list[IntArray]:
     Returns:
         Indices of the members of each group, ordered by their first members. each (n,)
     """
-    links = (np.ones(len(first)), (first, second))
+    links = (np.ones(len(first)), (first, second))  # values, rows and columns of the graph
     graph = coo_array(links, shape=(count, count))
     num_groups, group_of = connected_components(graph, directed=False)
     return [np.flatnonzero(group_of == group) for group in range(num_groups)]

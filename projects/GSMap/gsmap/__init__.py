@@ -1,7 +1,7 @@
 """Online vectorized HD-map construction with 2D Gaussians.
 
-The names below are imported when they are first used (docs/library.md). docs/architecture.md says
-which packages need torch and OpenMMLab. A config registers every model, data set and metric with
+The names below are imported when they are first used (docs/library.md). docs/architecture.md lists
+the packages that need torch and OpenMMLab. A config registers every model, data set and metric with
 ``custom_imports = dict(imports=['gsmap.registered'])``.
 """
 
@@ -21,8 +21,8 @@ if starts_a_command():
 use_one_thread_in_forks()
 # Imports do not read settings files in the working folder.
 sys.meta_path.insert(0, SettingsGuard)
-# An mmcv without compiled operators gets a replacement. Finders at the end are asked last, so the
-# compiled operators come first if mmcv has them.
+# An mmcv without compiled operators gets replacements for them. Python asks the last finder last,
+# so the compiled operators are used if mmcv has them.
 sys.meta_path.append(MmcvExtFinder)
 # Modules of this package can be imported by their former names.
 sys.meta_path.append(MovedModules())

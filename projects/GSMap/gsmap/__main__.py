@@ -45,9 +45,10 @@ def main() -> None:
         sys.exit(BAD_INPUT)
     else:
         CommandParser.program = f"gsmap {name}"
+        # Drop ``gsmap``, and replace the name of the command by the path of its script.
         del sys.argv[0]
         sys.argv[0] = str(tools[name])
-        sys.path.insert(0, str(tools[name].parent))  # like Python for a script
+        sys.path.insert(0, str(tools[name].parent))  # as Python does for a script
         runpy.run_path(sys.argv[0], run_name="__main__")
 
 

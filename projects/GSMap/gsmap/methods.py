@@ -50,8 +50,8 @@ class Method:
               ``configs/tables.json`` that has rows of this method.
             - ``upstream``, optional: Settings of ``convert_config.py``. ``models`` lists the types
               of the authors' detectors. ``configs`` lists our configs, each with its BEV
-              ``encoder`` and ``data_set``. A config with ``depth`` is only for samples with or
-              without depth maps.
+              ``encoder`` and ``data_set``. A config with the entry ``depth`` is only for samples
+              with depth maps (true) or without them (false).
         """
         return read_json(self.folder / "paper.json")
 

@@ -47,7 +47,7 @@ class MmcvExtFinder:
 
 
 def get_compiling_cuda_version() -> str:
-    """Return the CUDA version in the words of an mmcv that was built without CUDA."""
+    """Return the text that an mmcv built without CUDA returns as its CUDA version."""
     return "not available"
 
 
@@ -89,7 +89,7 @@ def hard_voxelize_forward(
 
 
 def modulated_deform_conv_forward(*tensors: Tensor, **geometry: Any) -> None:
-    """Compute a modulated deformable convolution into the output tensor of mmcv.
+    """Compute a modulated deformable convolution and write it to the output tensor of mmcv.
 
     Args:
         tensors: Images, weight, bias, ones, offset, mask, output and columns, in the order of mmcv.
@@ -101,7 +101,7 @@ def modulated_deform_conv_forward(*tensors: Tensor, **geometry: Any) -> None:
 
 
 def modulated_deform_conv_backward(*tensors: Tensor, **geometry: Any) -> None:
-    """Compute the gradients of a modulated deformable convolution into the tensors of mmcv.
+    """Compute the gradients of a modulated deformable convolution and write them to mmcv's tensors.
 
     Args:
         tensors: Images, weight, bias, ones, offset, mask and columns; then the gradients of images,

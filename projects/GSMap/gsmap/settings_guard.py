@@ -3,9 +3,9 @@
 The working folder may hold files of unknown origin, such as a downloaded data set. Some libraries
 read settings there:
 
-* matplotlib reads ``matplotlibrc`` and numba reads ``.numba_config.yaml`` on import. Numba reads
-  it again when it compiles. The file may name a folder of compiled kernels. These are pickles,
-  which can run any code when they are loaded.
+* matplotlib reads ``matplotlibrc`` on import. Numba reads ``.numba_config.yaml`` on import and
+  again when it compiles. This file may name a folder of compiled kernels. These are pickles, which
+  can run any code when they are loaded.
 * OpenCV prepends a folder to ``LD_LIBRARY_PATH`` and leaves an empty entry there. Because of the
   empty entry, all programs started later load libraries from the working folder first.
 
@@ -67,7 +67,7 @@ _SKLEARN = (
 
 
 class _DeferredModule(ModuleType):
-    """Placeholder of a module with functions and classes that are imported when they are called."""
+    """Placeholder of a module. It imports the module when one of its functions is called."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("__"):
@@ -111,10 +111,10 @@ _GUARDS: dict[str, _Guard] = {
 
 
 class SettingsGuard:
-    """Import finder that imports the modules of ``_GUARDS`` under their guards.
+    """Import finder for the modules of ``_GUARDS``. Each is imported under its guard.
 
-    It is the first entry of ``sys.meta_path``. Modules that were imported before ``gsmap`` are not
-    guarded.
+    A guard is a context manager that is active while the module is imported. The finder is the
+    first entry of ``sys.meta_path``. Modules that were imported before ``gsmap`` are not guarded.
     """
 
     @staticmethod

@@ -1,4 +1,7 @@
-"""Cameras of a bag: camera info by the rules of ROS' image_pipeline, and topics of images."""
+"""Cameras of a bag: camera info by the rules of ROS' image_pipeline, and topics of images.
+
+A camera info has the camera matrix K of raw images and the projection matrix P of rectified images.
+"""
 
 import re
 from dataclasses import dataclass, field
@@ -46,7 +49,7 @@ class ImageTopic:
         self.times_ns.append(time_ns)
 
     def notes(self, topic: str) -> list[str]:
-        """Notes on missing and repeated stamps."""
+        """Notes on missing and repeated stamps (times in the headers of messages)."""
         count = len(self.times_ns)
         notes = []
         if self.unstamped:
@@ -164,12 +167,13 @@ def build_camera(
             f"{offset_px}. This makes images of {size_px} pixels, but its images have "
             f"{image_sizes[0]}: record the camera info of these images, or give --calibration"
         )
+    needs_rectification = has_distortion and not rectified
     camera = RigCamera(
         name=name,
         intrinsics=matrix,
         cam_from_ground=cam_from_ground,
         size_px=size_px,
-        distortion=np.zeros(0) if rectified or not has_distortion else distortion,
+        distortion=distortion if needs_rectification else np.zeros(0),
         model=str(info.distortion_model),
     )
     return camera, notes
@@ -187,8 +191,8 @@ def _choose_matrix(info: Any, rectified: bool, where: str) -> tuple[np.ndarray, 
         where: Beginning of messages.
 
     Returns:
-        The matrix (3, 3), and a note on a replacement. The matrix stays empty for a camera info
-        without a size, which `RigCamera` refuses.
+        The matrix (3, 3), and a note if it replaces the other one. The matrix may be empty if the
+        camera info has no size. `RigCamera` then raises an error.
     """
     k = _matrix(info, "k")
     p = _matrix(info, "p")

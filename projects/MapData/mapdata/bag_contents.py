@@ -1,4 +1,4 @@
-"""First pass over a bag, for its calibrations, transforms, poses, and the times of all images."""
+"""First pass over a bag, which reads calibrations, transforms, poses, and the times of images."""
 
 import hashlib
 from collections import Counter, defaultdict
@@ -35,9 +35,9 @@ class BagContent:
         infos: Camera info, by the topic of the images.
         images: Frame, times and sizes of the images, by their topic.
         tree: Frames of the transforms.
-        odometries: Odometry, by topic, parent and child.
-        digest: Digest of all messages. The folder of the images is named by it.
-        unread: Errors of messages that cannot be read, by topic.
+        odometries: Odometry, by topic, parent frame and child frame.
+        digest: SHA-256 object of all messages. The folder of the images is named by its digest.
+        unread: Errors of single messages that cannot be read, by topic.
         unreadable: Reason why no message of a topic can be read, by topic.
         unstamped: Number of transforms and poses with the stamp 0, by topic.
         changed_infos: Number of camera infos that differ from the first one of the camera, by the
@@ -57,7 +57,7 @@ class BagContent:
     def add_info(self, topic: str, info: Any) -> bool:
         """Store the first camera info with focal lengths, and count later ones that differ from it.
 
-        Until there is one, each camera info replaces the stored one.
+        Before that, each camera info without focal lengths is stored in place of the previous one.
 
         Args:
             topic: Topic of the images.
@@ -125,7 +125,7 @@ class BagContent:
             images.unstamped += 1
 
     def reason(self, topics: Sequence[str]) -> str:
-        """Reason why messages of some topics cannot be read; empty if all can be read."""
+        """Return the reason why messages of any of the topics cannot be read; empty if all can."""
         for topic in topics:
             if topic in self.unreadable:
                 return self.unreadable[topic]
@@ -135,7 +135,7 @@ class BagContent:
         return ""
 
     def notes(self) -> list[str]:
-        """Notes on messages that cannot be read or are not used."""
+        """Return notes on messages that cannot be read or are not used."""
         notes = [f"{topic!r} is left out: {reason}" for topic, reason in self.unreadable.items()]
         for topic, count in self.changed_infos.items():
             notes.append(
@@ -195,7 +195,8 @@ def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
 
     Args:
         bag: The bag, open.
-        topics: Topics of the images and of the camera info, which may be empty, by camera.
+        topics: For each camera, the topics of its images and of its camera info. The topic of the
+            camera info is empty if there is none.
 
     Returns:
         The content; messages that cannot be read are left out and noted.
@@ -233,7 +234,10 @@ def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
 def _readable_connections(
     bag: Bag, topics: Mapping[str, tuple[str, str]], content: BagContent
 ) -> list[Any]:
-    """Connections of cameras, transforms and odometry; unreadable topics are noted in content."""
+    """Select the connections of cameras, transforms and odometry that can be read.
+
+    The reasons for the other topics are stored in ``content.unreadable``.
+    """
     camera_topics = set()
     for image_topic, info_topic in topics.values():
         camera_topics.add(image_topic)

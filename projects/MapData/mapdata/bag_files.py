@@ -1,4 +1,4 @@
-"""Files of a bag: their suffixes, the parts of a recording, and damages that can be mended."""
+"""Files of a bag (a ROS recording): their suffixes, the parts of a recording, and their damage."""
 
 import re
 import struct
@@ -15,7 +15,7 @@ from mapdata.ros_bag import RosBag
 Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_MOST_BYTES = 300_000  # largest metadata; YAML takes some milliseconds for a thousand bytes
+_MOST_BYTES = 300_000  # largest metadata; parsing a thousand bytes of YAML takes milliseconds
 _ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", flags=re.MULTILINE)  # alias of YAML, such as *name
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
 # First bytes of a file, by its suffix.
@@ -91,7 +91,7 @@ def _bag_of(parts: Sequence[Path], notes: list[str]) -> Bag:
 
 
 def _needs_mcap_reader(parts: Sequence[Path]) -> bool:
-    """Whether files are MCAP files, and at least one of them is not readable by rosbags."""
+    """Whether files are MCAP files, at least one of which the package rosbags cannot read."""
     return parts[0].suffix == ".mcap" and not all(map(is_plain_ros2, parts))
 
 
@@ -213,7 +213,7 @@ def _damage_of(path: Path) -> str | None:
             " keeps what is readable"
         )
     if path.suffix == ".bag":
-        # The header holds the position of the index, which is 0 until the recorder ends.
+        # The header contains the position of the index, which is 0 until the recorder ends.
         index = re.search(rb"index_pos=(.{8})", start, flags=re.DOTALL)
         position = struct.unpack("<Q", index[1])[0] if index else 0
         if not 0 < position <= size:
@@ -228,13 +228,13 @@ def _sqlite_size(header: bytes) -> int:
     """Size of an SQLite file in bytes, according to its header."""
     page_size = struct.unpack(">H", header[16:18])[0]
     if page_size == 1:
-        page_size = 65536  # which does not fit the two bytes
+        page_size = 65536  # too large for the two bytes, so SQLite writes 1
     page_count = struct.unpack(">I", header[28:32])[0]
     return page_size * page_count
 
 
 def suffix_advice(path: Path) -> str | None:
-    """Advice on a file that is probably a bag, but has none of ``SUFFIXES``; None on others."""
+    """Advice on a file that is probably a bag without one of ``SUFFIXES``; None for other files."""
     name = path.name
     suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes[-2:] == [".bag", ".active"]:

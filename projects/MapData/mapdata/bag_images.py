@@ -1,4 +1,4 @@
-"""Images of a bag's messages, as JPEG files."""
+"""Writing of the images in a ROS bag's messages as JPEG files."""
 
 from io import BytesIO
 from pathlib import Path
@@ -13,7 +13,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_bytes
 from mapdata.folders.rig import RigCamera
 
-# OpenCV's code of the conversion to BGR, by ROS' name of the encoding; None needs no conversion.
+# OpenCV's code for the conversion to BGR, by ROS' name of the encoding; None for no conversion.
 _TO_BGR: dict[str, int | None] = {
     "bgr8": None, "8UC3": None, "rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR,
     "bgra8": cv2.COLOR_BGRA2BGR, "mono8": cv2.COLOR_GRAY2BGR, "8UC1": cv2.COLOR_GRAY2BGR,
@@ -28,17 +28,17 @@ _PIXEL_BYTES = {  # bytes of a pixel, by encoding; an encoding that is not liste
     "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4,
     "yuv422_yuy2": 2, "yuyv": 2, "yuv422": 2, "uyvy": 2,
 }  # fmt: skip
-# Formats of compressed messages that are no pictures.
+# Formats of compressed messages that are not pictures.
 _DEPTHS = ("16UC1", "32FC1")
 _VIDEO = ("h264", "h265", "hevc", "av1", "vp8", "vp9", "theora", "ffmpeg")
 
 
 def trouble_with(message: Any) -> str | None:
-    """Reason why images in a message's encoding cannot be used; None if they can.
+    """Return the reason why a message's image cannot be used; None if its format is supported.
 
     Args:
         message: Message of ROS: a raw image with ``encoding`` (``sensor_msgs/Image``), or a
-            compressed one with ``format`` (``sensor_msgs/CompressedImage``).
+            compressed image with ``format`` (``sensor_msgs/CompressedImage``).
     """
     if hasattr(message, "encoding"):
         if message.encoding in _TO_BGR:
@@ -53,7 +53,7 @@ def trouble_with(message: Any) -> str | None:
 
 
 def image_size(message: Any) -> tuple[int, int] | None:
-    """Width and height of a message's image in pixels; None if the image is damaged."""
+    """Return width and height of a message's image in pixels; None if the image is damaged."""
     if hasattr(message, "encoding"):
         return int(message.width), int(message.height)
     content = np.asarray(message.data, dtype=np.uint8).tobytes()
@@ -65,7 +65,7 @@ def image_size(message: Any) -> tuple[int, int] | None:
 
 
 def write_image(message: Any, camera: RigCamera, target: Path, where: str) -> None:
-    """Write a message's image as JPEG, rectified if the camera has distortion.
+    """Write a message's image as JPEG. The image is rectified if the camera has distortion.
 
     Args:
         message: Message of rosbags, with a raw or a compressed image.

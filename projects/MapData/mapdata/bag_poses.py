@@ -13,17 +13,17 @@ from mapdata.folders.rig import PoseTrack
 VEHICLE_FRAMES = ("base_footprint", "base_link")
 _GAP_NS = 10**9  # longest gap between two poses in which the pose is interpolated
 _FOREVER_NS = 10**20  # gap of a static transform, longer than any recording
-_SELDOM_NS = 500_000_000  # transforms sent less often than this on average hold until the next one
+_SELDOM_NS = 500_000_000  # transforms with a longer mean interval are valid until the next one
 _STILL_M = 1e-3  # smaller changes of a pose do not count as a motion
 _STILL_JUMP_M = 0.1  # smaller distances of successive poses do not count as jumps
-# Ranks of odometry by the frame of its body; the lowest is preferred.
+# Ranks of odometry by the frame whose poses it contains; the lowest rank is preferred.
 _OF_VEHICLE = 0
 _OF_CONNECTED_FRAME = 1
 _OF_UNKNOWN_FRAME = 2
 
 
 def is_static_topic(topic: str) -> bool:
-    """Whether the transforms of a topic hold for the whole recording."""
+    """Whether the transforms of a topic are valid for the whole recording."""
     return topic.endswith("tf_static")
 
 
@@ -35,11 +35,11 @@ class Transforms:
         topic: Topic of the messages.
         child: Name of the frame.
         parent: Name of the frame above it.
-        is_static: Whether the topic is static, so that the first message holds.
-        times_ns: Times of the transforms, in the order of the bag. (n,)
-        poses: Transforms from the child to the parent, in metres. each (4, 4)
+        is_static: Whether the topic is static, so that the first message is always valid.
+        times_ns: Times of the transforms, in the order of the bag; one time if static. (n,)
+        poses: Transforms from the child to the parent, in metres. (4, 4) each
         count: Number of messages.
-        num_changes: Number of static transforms that differ from the first one.
+        num_changes: Number of later messages of a static topic that differ from the first one.
     """
 
     topic: str
@@ -69,7 +69,7 @@ class Transforms:
         return bool(np.abs(np.array(self.poses) - self.poses[0]).max() > _STILL_M)
 
     def __str__(self) -> str:
-        """Parent and source, for notes such as "the transforms from 'base_link' to ..."."""
+        """Return parent and topic, for notes such as "the transforms from 'base_link' to ..."."""
         return f"{self.parent!r} ({self.count} messages on {self.topic})"
 
 
@@ -82,7 +82,7 @@ class Odometry:
         parent: Name of the frame that the poses refer to.
         child: Name of the body's frame; may be empty.
         times_ns: Times of the poses. (n,)
-        poses: Transforms from the child to the parent, in metres. each (4, 4)
+        poses: Transforms from the child to the parent, in metres. (4, 4) each
     """
 
     topic: str
@@ -99,7 +99,7 @@ class PoseChain:
     """Pose of the ground below a vehicle as a function of time, from a chain of transforms.
 
     Args:
-        steps: Pose tracks from the vehicle's frame up to the root.
+        steps: Pose tracks from the vehicle's frame up to the root of the frame tree.
         ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
         span_ns: First and last time at which all tracks have a pose.
     """
@@ -112,7 +112,7 @@ class PoseChain:
         self.span_ns = span_ns
 
     def __call__(self, time_ns: int) -> np.ndarray | None:
-        """Pose of the ground in the root at a time; None if a track lacks a pose. (4, 4)"""
+        """Return the pose of the ground in the root at a time; None if a track has none. (4, 4)"""
         pose = self.ground
         for step in self.steps:
             parent_from_child = step.at(time_ns)
@@ -126,11 +126,12 @@ class PoseChain:
 class FrameTree:
     """Tree of the frames of a bag, in which each frame has one parent.
 
-    If a frame has several parents, or transforms on several topics, a parent that leads to the
-    vehicle is preferred, then the one with the most messages, then the first topic by name.
+    If a frame has several parents, or transforms on several topics, the source is preferred whose
+    parent leads to the vehicle, then the source with the most messages, then the first topic by
+    name.
 
     Args:
-        edges: Transforms of each frame, by their topic and parent.
+        edges: Transforms of each frame, by the topic and the parent.
         notes: Notes on transforms that are not used.
     """
 
@@ -168,8 +169,9 @@ class FrameTree:
         """Choose the vehicle's frame, and one parent for each frame.
 
         Args:
-            wanted: Name of the vehicle's frame. None takes the first of ``VEHICLE_FRAMES`` in the
-                bag that moves, or the first in the bag if none moves.
+            wanted: Name of the vehicle's frame. None selects the first of ``VEHICLE_FRAMES`` that
+                has a transform above it that is not static. If none has, it selects the first of
+                them in the bag.
 
         Returns:
             Name of the vehicle's frame.
@@ -208,7 +210,7 @@ class FrameTree:
         self.notes.clear()
 
         def rank(edge: Transforms) -> tuple[bool, int, str]:
-            """Sort key of a source of transforms; the smallest one is the best."""
+            """Sort key of a source of transforms; the smallest key is the best."""
             leads_to_vehicle = edge.child != vehicle and self._leads(edge.parent, vehicle)
             return not leads_to_vehicle, -edge.count, edge.topic
 
@@ -241,7 +243,7 @@ class FrameTree:
         return False
 
     def chain(self, frame: str) -> list[str]:
-        """Names of a frame and all frames above it, up to the root.
+        """Return the names of a frame and of all frames above it, up to the root.
 
         Raises:
             ValueError: If the transforms form a circle.
@@ -255,7 +257,7 @@ class FrameTree:
         return names
 
     def between(self, vehicle: str, frame: str) -> np.ndarray | None:
-        """Pose of a frame in the vehicle's frame; None if the two are not connected. (4, 4)
+        """Return the pose of a frame in the vehicle's frame; None if not connected. (4, 4)
 
         If a transform between the two moves, its first pose is used, with a note in ``notes``.
         """
@@ -269,13 +271,14 @@ class FrameTree:
         return invert_rigid(common_from_vehicle) @ common_from_frame
 
     def _pose_below(self, ancestor: str, names: Sequence[str], frame: str) -> np.ndarray:
-        """Pose of the first frame of a chain in a frame above it, by their first transforms. (4, 4)
+        """Compute the pose of the first frame of a chain in a frame above it. (4, 4)
 
-        Transforms that move are noted, as they affect where ``frame`` is on the vehicle.
+        The first pose of each transform is used. Transforms that move are noted, because they
+        affect the place of ``frame`` on the vehicle.
 
         Args:
             ancestor: Name of the frame above.
-            names: Chain, from the first frame upwards.
+            names: Names of the chain, from the first frame upwards.
             frame: Name of the sensor's frame, for the notes.
         """
         pose = np.eye(4)
@@ -291,22 +294,22 @@ class FrameTree:
         return pose
 
     def poses(self, vehicle: str, ground: np.ndarray) -> PoseChain | None:
-        """Poses of the ground below the vehicle, from the transforms above the vehicle's frame.
+        """Compute the poses of the ground below the vehicle from the transforms above its frame.
 
         Args:
             vehicle: Name of the vehicle's frame.
             ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
 
         Returns:
-            The poses; None if no transform moves, or transforms jump back and forth.
+            The poses; None if all transforms are static, or if poses jump back and forth.
         """
         lower_frames = self.chain(vehicle)[:-1]  # the root has no transform to a parent
         edges = [self._chosen[name] for name in lower_frames]
         moving_edges = [edge for edge in edges if not edge.is_static]
         if not moving_edges:
             return None
-        # The poses are known where all moving transforms have a pose. The one next to the vehicle
-        # defines the span, which the others can only shorten.
+        # The poses are known at the times at which all moving transforms have a pose. The moving
+        # transform next to the vehicle defines the span, which the others can only shorten.
         lowest = moving_edges[0]
         start_ns = min(lowest.times_ns)
         end_ns = max(lowest.times_ns)
@@ -317,7 +320,8 @@ class FrameTree:
             if edge.is_static:
                 steps.append(PoseTrack(edge.times_ns, edge.poses, gap_ns=_FOREVER_NS))
                 continue
-            # Some transforms, such as from the odometry to the map, are only sent when they change.
+            # Some transforms, such as from the odometry to the map, are sent only when they change.
+            # They are valid until the next one.
             count = len(edge.times_ns)
             is_seldom = count == 1 or count * _SELDOM_NS < drive_ns
             holds = edge is not lowest and is_seldom
@@ -334,11 +338,11 @@ class FrameTree:
 
 
 def _jump_notes(track: PoseTrack, source: str) -> list[str]:
-    """Note on poses that alternate between two places, as if two publishers sent them."""
+    """Return a note if poses alternate between two places, as if two publishers sent them."""
     places = track.poses[:, :3, 3]
     if len(places) < 5:
         return []
-    # If places alternate, the next one is far away, and the one after it is near again.
+    # If places alternate, the next place is far away, and the place after it is near again.
     to_next = float(np.median(np.linalg.norm(places[1:] - places[:-1], axis=1)))
     to_second = float(np.median(np.linalg.norm(places[2:] - places[:-2], axis=1)))
     if to_next < 2 * to_second + _STILL_JUMP_M:
@@ -352,11 +356,11 @@ def _jump_notes(track: PoseTrack, source: str) -> list[str]:
 def odometry_poses(
     odometries: Sequence[Odometry], tree: FrameTree, vehicle: str, ground: np.ndarray
 ) -> tuple[PoseChain | None, list[str]]:
-    """Poses of the ground below the vehicle, from the odometry of one topic.
+    """Compute the poses of the ground below the vehicle from the odometry of one topic.
 
     Odometry of the vehicle's frame is preferred, then odometry of a frame that is connected to it,
-    then odometry without a frame. If several odometries are equal in this, the one with the most
-    poses is used.
+    then odometry without a frame. Among several odometries of one kind, the one with the most poses
+    is used.
 
     Args:
         odometries: All odometries of a bag.
@@ -365,7 +369,7 @@ def odometry_poses(
         ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
 
     Returns:
-        The poses, or None without usable odometry, and notes on assumptions.
+        The poses (None without usable odometry), and notes on assumptions.
     """
     # Rank (0 is the best), index in ``odometries``, and transform from the vehicle's frame to the
     # frame of the odometry's body.
@@ -379,7 +383,7 @@ def odometry_poses(
         if not child or not vehicle:
             candidates.append((_OF_UNKNOWN_FRAME, number, np.eye(4)))
             continue
-        # The body takes the place of the vehicle in `between`, which gives the pose in its frame.
+        # `between` returns the pose of its second frame (the vehicle) in its first (the body).
         child_from_vehicle = tree.between(child, vehicle) if child in tree.frames else None
         if child_from_vehicle is None:
             notes.append(
@@ -392,7 +396,7 @@ def odometry_poses(
         return None, notes
 
     def order(candidate: tuple[int, int, np.ndarray]) -> tuple[int, int]:
-        """Sort key of a candidate; the smallest one is the best."""
+        """Sort key of a candidate; the smallest key is the best."""
         rank, number, _ = candidate
         return rank, -len(odometries[number].poses)
 

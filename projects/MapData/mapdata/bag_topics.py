@@ -22,11 +22,11 @@ _REMEDY = "say it by hand with --topics NAME=IMAGE_TOPIC,INFO_TOPIC for each cam
 
 
 def parse_topics(words: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Parse ``NAME=IMAGES,INFO`` of each camera. ``,INFO`` may be absent.
+    """Parse one word ``NAME=IMAGES,INFO`` for each camera. ``,INFO`` may be absent.
 
     Returns:
-        Topic of the images and topic of the camera info of each camera. The second is empty if it
-        is absent.
+        Topic of the images and topic of the camera info of each camera, by its name. The second is
+        empty if ``,INFO`` is absent.
 
     Raises:
         ValueError: If a word has another form, or the name of a camera repeats.
@@ -53,8 +53,8 @@ def check_topics(
 
     Args:
         kinds: Message type of each topic of the bag.
-        topics: Topic of the images and topic of the camera info of each camera. The second may be
-            empty.
+        topics: Topic of the images and topic of the camera info of each camera, by its name. The
+            second may be empty.
         listing: Topics of the bag as text, for error messages.
         needs_info: Whether each camera must have a topic of camera info.
 
@@ -80,14 +80,15 @@ def check_topics(
 
 
 def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
-    """Topic of the images of each camera; compressed images are preferred to raw images.
+    """Topic of the images of each camera, by its name; compressed images are preferred to raw ones.
 
-    A camera is named by the last part of its topic, or by all parts if names would repeat.
+    A camera is named by the last part of its topic that is not generic (such as ``image_raw``), or
+    by all parts up to it if names would repeat.
 
     Raises:
         ValueError: If two cameras would get one name.
     """
-    topic_of: dict[str, str] = {}  # by the topic without generic last parts
+    topic_of: dict[str, str] = {}  # keys are the topics without generic last parts
     for image_kind in IMAGES:
         for topic in sorted(kinds):
             parts = topic.split("/")
@@ -163,10 +164,10 @@ def _words(topic: str) -> list[str]:
 
 
 def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:
-    """Topics of camera info that may belong to images.
+    """Topics of camera info that may belong to a topic of images.
 
-    They are in the nearest namespace above the images. If several camera infos are there, topics
-    with the words of the images are preferred.
+    These are the topics of camera info in the nearest namespace above the images. If some of them
+    contain the distinguishing words of the images' topic (`_words`), only these are returned.
     """
     nearest = None
     for info in infos:

@@ -36,9 +36,9 @@ _CHOOSE = "choose cameras with --topics"
 def read_bag(path: Path, options: InputOptions) -> Source:
     """Read the samples of a bag in the frame ``ego``, and write their images as files.
 
-    Messages and topics that cannot be read are left out and noted. Images that cannot be decoded
-    are noted and not written, so that reading their samples fails. The folder of the images is
-    named by a digest of the bag, and existing images are reused.
+    Messages and topics that cannot be read are left out, with a note. Images that cannot be decoded
+    are not written, with a note; loading a sample with such an image fails later. The name of the
+    folder of the images contains a digest of the bag, and existing images are reused.
 
     Args:
         path: A file, a folder of rosbag2, or a folder with the parts of one recording.
@@ -71,7 +71,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     """Read the samples of an open bag.
 
     The cameras are built first, from their camera info or from a calibration file. Then the images
-    are grouped to frames at the times of one camera, and the frames with a pose become samples.
+    are grouped into frames at the times of one camera, and the frames with a pose become samples.
     Finally, the images of these frames are written.
     """
     kinds = {connection.topic: connection.msgtype for connection in bag.connections}
@@ -81,6 +81,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     # This is the pose of the ground below the vehicle, in the vehicle's frame. (4, 4)
     ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
     check_topics(kinds, options.topics, listing=listing, needs_info=calibration is None)
+    # `topics` below has the topic of the images and the topic of the camera info of each camera.
     if calibration is None:
         topics = options.topics or camera_topics(kinds, listing)
         content = read_content(bag, topics)
@@ -154,7 +155,7 @@ def _sampling_camera(names: Sequence[str]) -> str:
 def _group_images(
     times_ns: Mapping[str, np.ndarray], wanted_ns: Sequence[int], scene: str
 ) -> list[RigFrame]:
-    """Frames at the wanted times, each with the nearest image of every camera.
+    """Group images into frames at the wanted times, each with the nearest image of every camera.
 
     Args:
         times_ns: Times of the images, ascending, by camera. (n,) each
@@ -176,11 +177,11 @@ def _topics_of(
     options: InputOptions,
     kinds: Mapping[str, str],
 ) -> dict[str, tuple[str, str]]:
-    """Topics of the images of calibrated cameras, each with an empty topic of the camera info.
+    """Find the image topic of each calibrated camera; the topic of its camera info is empty.
 
     Args:
         calibrated_cameras: Cameras of the calibration file, with their setting ``images``.
-        options: The topics that the user has given.
+        options: Options with the topics that the user has given.
         kinds: Type of the messages, by topic.
     """
     images = {name: topic for name, (topic, _) in options.topics.items()}
@@ -196,7 +197,7 @@ def _topics_of(
 def _topic_of(
     name: str, images_setting: str, images: Mapping[str, str], kinds: Mapping[str, str]
 ) -> str:
-    """Topic of a calibrated camera's images: named by its calibration, or found by its name.
+    """Find the topic of a calibrated camera's images by its calibration, or else by its name.
 
     Args:
         name: Name of the camera.
@@ -255,7 +256,8 @@ def _build_rig(
 ) -> tuple[dict[str, RigCamera], list[str]]:
     """Build the cameras by the topic of their images, with notes on assumptions.
 
-    Unusable cameras are left out, unless the user named the topics or no camera is usable.
+    Unusable cameras are left out with a note. If the user named the topics (``by_hand``), or if no
+    camera is usable, the first error is raised instead.
     """
     rig = {}
     notes = []
@@ -394,7 +396,7 @@ def _write_images(
                 time_ns = stamp_ns(message.header) or recorded_ns
                 target = missing.pop((camera.name, time_ns), None)
         except ValueError:
-            continue  # the first pass has noted it
+            continue  # `read_content` has already made a note of it
         if target is None:
             continue
         where = f"camera {camera.name!r}, image at {target.stem} ns"

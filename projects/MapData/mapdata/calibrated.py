@@ -22,7 +22,7 @@ _POSE = "global_from_frame"
 def calibrated_records(
     records: Sequence[Mapping[str, Any]], file: Path, meta: AnnotationMeta, root: Path
 ) -> Iterator[dict[str, Any]]:
-    """Complete records with the cameras and the poses of a calibration file.
+    """Add the cameras and the poses of a calibration file to records, the dictionaries of samples.
 
     The cameras of a record have ``name`` and ``path``. A camera whose image was taken at another
     time than ``timestamp_ns`` of the record also has a ``timestamp_ns``. If the file names
@@ -45,8 +45,8 @@ def calibrated_records(
     """
     # Images of each camera. Their size is used if the calibration file has no ``size_px``.
     images: dict[str, list[Path]] = {}
-    # Time of each image by its name without the suffix, by which a file of poses may refer to it.
-    # If several cameras have images of one name, the time of the last of them is taken.
+    # Time of each image, by its file name without the suffix. A file of poses may refer to images
+    # by these names. If several images have one name, the time of the last image is used.
     time_of: dict[str, int] = {}
     for number, record in enumerate(records):
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
@@ -82,7 +82,7 @@ def calibrated_records(
 
 
 def _name_of(record: Any, number: int) -> Any:
-    """Token of a record, or the number of the record if it has no token."""
+    """Return the token of a record, or its number if it has no token."""
     return record.get("token", number) if isinstance(record, Mapping) else number
 
 
@@ -97,7 +97,7 @@ def _require_keys(camera: Mapping[str, Any], file: Path) -> None:
 
 
 def _time_of(camera: Mapping[str, Any], record: Mapping[str, Any]) -> int:
-    """Time of a camera's image in nanoseconds."""
+    """Return the time of a camera's image in nanoseconds."""
     time_ns = camera.get("timestamp_ns")
     if time_ns is None:
         time_ns = record.get("timestamp_ns") or 0
@@ -107,7 +107,11 @@ def _time_of(camera: Mapping[str, Any], record: Mapping[str, Any]) -> int:
 def _rig_frame(
     record: Mapping[str, Any], camera_of: Mapping[str, RigCamera], file: Path
 ) -> RigFrame:
-    """Images of a record by camera; a ``ValueError`` if the calibration file lacks a camera."""
+    """Collect the images of a record by camera.
+
+    Raises:
+        ValueError: If the calibration file lacks a camera.
+    """
     images: dict[str, tuple[str, int]] = {}
     for camera in record["cameras"]:
         name = str(camera["name"])
@@ -122,7 +126,7 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
     """Transform a sample from the frame ``ego`` to the frame of the annotation file."""
     ground_z_m = meta.ground_z_m
     # `ego_from_frame` of a record is the mounting of the sensor that defines the annotation frame.
-    # Without it, the usual mounting is taken.
+    # Without it, the usual mounting is assumed.
     ego_from_frame = record.get("ego_from_frame")
     if ego_from_frame is None:
         mount = Mount(meta.frame, ground_z_m=ground_z_m)

@@ -1,4 +1,4 @@
-"""Plausibility of calibrations: warnings, and a figure of the ground plane in the images."""
+"""Checks of calibrations: warnings, and a figure with the ground plane drawn into the images."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ _REACH_M = 30.0  # length of the ground lines ahead of and behind the vehicle
 _SIDE_REACH_M = 15.0  # length of the ground lines to the left and right of the vehicle
 _WEDGE_M = 6.0  # length of a field of view in the panel from above
 _WIDTH_PX = 3200  # six cameras of about 750 px, large enough to see an error of a few centimetres
-# Classes of the drawn lines; "cameras" are the fields of view. The order decides the colours.
+# Classes of the drawn lines; "cameras" are the fields of view. The order determines the colours.
 _LINE_CLASSES = ("ahead", "left", "every_5_m", "behind", "right", "cameras")
 
 
@@ -97,7 +97,7 @@ def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]
     reach = _REACH_M
     side = _SIDE_REACH_M
     ends = []
-    # without 0: the lines ahead, behind, left and right pass through it
+    # Without 0, where the lines ahead, behind, left and right are drawn instead.
     offsets = [offset for offset in np.arange(-reach, reach + 1, 5.0) if offset != 0]
     for x in offsets:
         ends.append(("every_5_m", (x, -side), (x, side)))
@@ -117,7 +117,7 @@ def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]
 
 
 def _field_of_view(camera: CameraRecord, frame_from_ground: np.ndarray) -> np.ndarray:
-    """Triangle of a camera's horizontal field of view on the road, in the frame. (4, 3)"""
+    """Closed triangle of a camera's horizontal field of view, on the road, in the frame. (4, 3)"""
     intrinsics = camera.intrinsics
     ground_from_cam = invert_rigid(camera.cam_from_frame @ frame_from_ground)
     rotation = ground_from_cam[:3, :3]

@@ -19,11 +19,11 @@ from gsmap.utils.progress import Progress
 from gsmap.utils.words import format_count
 from mapdata.command_line import add_workers_option
 
-_MOST_PROBLEMS = 10  # number of broken files that a message names
+_MOST_PROBLEMS = 10  # largest number of broken files that a message names
 
 
 def _open(path: Path) -> AnnotationFile:
-    """Open and check an annotation file, and compare its batches with those that its footer lists.
+    """Open and check an annotation file, and compare its batches with the batches in its footer.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -69,7 +69,7 @@ def _broken_files(sample: MapSample, root: Path) -> list[str]:
 
 
 def _describe_content(file: AnnotationFile) -> list[str]:
-    """Number of the elements, and warnings about implausible elements and cameras."""
+    """Describe the number of elements, and warn about implausible elements and cameras."""
     counts = file.instance_counts()
     counts = counts[counts >= 0]  # a sample whose ground truth is not known has -1
     lines = []
@@ -94,7 +94,8 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
 
     Args:
         paths: Annotation files.
-        root: Folder that paths of images and sweeps are relative to; None does not read them.
+        root: Folder that paths of images and sweeps are relative to. If None, images and sweeps are
+            not read.
         workers: Number of processes that read images and sweeps.
 
     Returns:

@@ -23,16 +23,16 @@ class FileOptions:
     Args:
         root: Folder of the data set, which paths in annotation files are relative to.
         classes: Classes of map elements, in label order.
-        x_range: Smallest and largest x of the ground truth in the frame, in metres.
-        y_range: Smallest and largest y of the ground truth in the frame, in metres.
+        x_range: Smallest and largest x of the ground truth in the annotation frame, in metres.
+        y_range: Smallest and largest y of the ground truth in the annotation frame, in metres.
         max_sweeps: Number of earlier LiDAR sweeps per sample.
-        out_dir: Folder of the annotation files; None takes ``root``.
+        out_dir: Folder of the annotation files; None for ``root``.
         tag: Suffix of the file names, such as ``_extended``.
         workers: Number of processes.
         shard: Part of the samples to convert.
-        command: Command line, which messages about the files quote.
-        split_name: Name of a published split; empty takes the official one.
-        split_file: File with splits in place of a published one.
+        command: Command line that creates the files, for messages about them.
+        split_name: Name of a published split; empty for the official one.
+        split_file: File that defines splits; None for a published split.
         allow_missing: Whether scenes of a published split may be missing.
     """
 
@@ -86,11 +86,11 @@ class FileOptions:
 
 
 def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:
-    """Digest of the sources of a file.
+    """Compute a digest of the source files of an annotation file.
 
     Args:
-        sizes: Size of each file in bytes, by its name.
-        contents: Files whose content is part of the digest.
+        sizes: Size of each source file in bytes, by its name.
+        contents: Source files whose content is part of the digest.
 
     Returns:
         16 hexadecimal digits.
@@ -177,7 +177,7 @@ def parse_rate(text: str) -> float | None:
     """Parse samples per second, such as ``2.5hz`` or ``2``; ``all`` gives None.
 
     Raises:
-        ValueError: If the text is no rate > 0.
+        ValueError: If the text is not a rate > 0.
     """
     if text.lower() == "all":
         return None

@@ -1,7 +1,7 @@
-"""Pedestrian crossings as map elements: long edges, or outlines that are open.
+"""Pedestrian crossings as map elements: their long edges, or their outlines as open lines.
 
-A local map is cut to a rectangle around the vehicle, the patch. An open outline ends where the edge
-of the patch cuts the crossing.
+A local map is cut to a rectangle around the vehicle, the patch. An outline that the edge of the
+patch cuts is open: it ends at the edge.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ PARALLEL_COSINE_GAP = 0.01  # one minus the cosine of the largest angle, about 8
 
 
 def long_edges(polygons: np.ndarray) -> np.ndarray:
-    """Find the two longest edges of each polygon, the longer one second. (n,) -> (2 n,)"""
+    """Find the two longest edges of each polygon, the longest one last. (n,) -> (2 n,)"""
     edges = []
     for polygon in polygons:
         ring = shapely.get_coordinates(polygon.exterior)
@@ -33,8 +33,8 @@ def long_edges(polygons: np.ndarray) -> np.ndarray:
 def open_outlines(pieces: np.ndarray, owner: np.ndarray, patch: LocalPatch) -> np.ndarray:
     """Outlines of crossings, with parallel neighbours united, open where the patch cuts them.
 
-    They run anticlockwise, and holes are left out. An outline that is cut into several lines is
-    returned as one line through all of them.
+    Outlines run anticlockwise, and holes are left out. An outline that is cut into several lines is
+    returned as one line that connects them.
 
     Args:
         pieces: Valid parts of crossings inside the patch, in its frame, in metres. (pieces,)
@@ -96,8 +96,8 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
     begins_before_end = (bounds[:, None, :2] <= bounds[None, :, 2:]).all(-1)  # (n, n)
     near = begins_before_end & begins_before_end.T
     np.fill_diagonal(near, False)
-    is_free = np.ones(len(crossings), dtype=bool)
-    sides = np.zeros((len(crossings), 2))
+    is_free = np.ones(len(crossings), dtype=bool)  # False once a crossing is in `merged`
+    sides = np.zeros((len(crossings), 2))  # unit vectors; only crossings with a neighbour need them
     for i in np.flatnonzero(near.any(1)):
         sides[i] = _long_side(crossings[i])
     merged = []

@@ -70,16 +70,16 @@ def from_records(
       (3, 3) in pixels, ``cam_from_frame`` (4, 4), and, to avoid opening the image, ``width`` and
       ``height``. With ``distortion`` (OpenCV's coefficients, and ``distortion_model`` as in
       docs/inference.md) the image is rectified into ``rectified/`` of the data root;
-    - ``instances`` (without it, no ground truth is known): mappings with ``label`` (name or index)
-      and ``points`` (n, 2 or 3) in metres, with equal first and last points of rings. Elements are
-      clipped to the range of ``meta``; rings stay rings;
+    - ``instances``: mappings with ``label`` (name or index) and ``points`` (n, 2 or 3) in metres.
+      The first and the last point of a ring are equal. Elements are clipped to the range of
+      ``meta``; rings stay rings. Without this key and the next one, the sample has no ground truth;
     - ``global_instances``: elements in the global frame in place of ``instances``, such as a whole
       map. They are transformed to the frame by the position and the yaw of ``global_from_frame``
       or, in annotation files with heights, by the whole pose;
     - ``lidar``: mapping with ``path``, ``frame_from_lidar`` (4, 4) and ``sweeps``, mappings with
       ``path``, ``timestamp_ns``, ``frame_from_lidar``;
-    - ``ego_from_frame`` (4, 4): pose of the frame ``lidar`` on the vehicle, whose z = 0 is the
-      road. Without it, the pose is not known, and a warning describes the consequences;
+    - ``ego_from_frame`` (4, 4): pose of the frame ``lidar`` in the frame of the vehicle, in which
+      the road is at z = 0. Without it, a warning describes the consequences;
     - ``scene``, ``map_name``, ``timestamp_ns``, ``global_from_frame``, ``can_bus``.
 
     Args:
@@ -106,7 +106,8 @@ def from_records(
         _LOGGER.warning(_UNKNOWN_ROAD, path)
     source = ""
     if shard.count:
-        # Shards are joined only if they were cut from one list, which is recognized by its tokens.
+        # Shards can be joined only if they are parts of one list. `source` identifies the list by
+        # the tokens of all records.
         records = list(records)
         tokens = []
         for record in records:
@@ -166,7 +167,7 @@ def create_samples(
 def _clip_elements(
     elements: Sequence[MapInstance], meta: AnnotationMeta, join: bool
 ) -> list[MapInstance]:
-    """Clip elements to the range of an annotation file, after joining lines if asked for."""
+    """Join lines if ``join`` is True, then clip all elements to the range of an annotation file."""
     if join:
         elements = join_lines(elements)
     pieces = []
@@ -178,11 +179,11 @@ def _clip_elements(
 
 
 def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
-    """Join lines of one class whose ends meet, such as lines of a map in tiles.
+    """Join lines of one class whose ends meet, such as lines of a map that is stored in tiles.
 
-    Ends within 0.1 m of each other in the plane meet. Lines are joined at places where two ends
-    meet, not at places where three or more meet, such as forks. Lines may be reversed. Rings are
-    not changed.
+    Two ends meet if they are within 0.1 m of each other in the plane. Lines are joined at places
+    where exactly two ends meet, but not at forks, where three or more meet. Lines may be reversed.
+    Rings are not changed.
 
     Args:
         instances: Map elements, in metres.
@@ -208,7 +209,7 @@ def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
 
 
 def _snap_ends(lines: Sequence[Points]) -> None:
-    """Give equal coordinates to ends of lines that meet, in place. each (n, dim)"""
+    """Give equal coordinates to the ends of lines that meet, in place. (n, dim) each"""
     places: list[np.ndarray] = []
     for line in lines:
         for end in (0, -1):  # first and last vertex
@@ -216,7 +217,7 @@ def _snap_ends(lines: Sequence[Points]) -> None:
             place = _nearby_place(places, line[end])
             if place is None:
                 places.append(line[end].copy())
-            elif not (other_end == place).all():  # else a short line would become a point
+            elif not (other_end == place).all():  # otherwise a short line would become a point
                 line[end] = place
 
 
@@ -280,7 +281,8 @@ def _transform_elements(record: Mapping[str, Any], meta: AnnotationMeta) -> dict
     for item in record[_GLOBAL]:
         points = np.array(item["points"], np.float64)[:, : meta.dim]
         offsets = points - pose[: points.shape[1], 3]
-        instances.append({**item, "points": offsets @ rotation})  # rows times R: inverse rotation
+        local_points = offsets @ rotation  # points are rows, so this is the inverse rotation
+        instances.append({**item, "points": local_points})
     local_record = {name: value for name, value in record.items() if name != _GLOBAL}
     local_record["instances"] = instances
     return local_record
@@ -345,7 +347,7 @@ def _class_index(label: Any, meta: AnnotationMeta) -> int:
 
 
 def _clip(points: Points, meta: AnnotationMeta) -> list[Points]:
-    """Clip an element to the range of an annotation file; rings stay rings. each (n, dim)"""
+    """Clip an element to the range of an annotation file; rings stay rings. (n, dim) each"""
     low, high = np.array([meta.x_range, meta.y_range]).T
     if ((points[:, :2] >= low) & (points[:, :2] <= high)).all():
         return [points]

@@ -1,7 +1,7 @@
-"""Bounded decompression of bags, so that a small file cannot fill the memory.
+"""Bounded decompression of bags (recordings of ROS), so that a small file cannot fill the memory.
 
 The libraries that read bags decompress without a limit. Their decompression functions are replaced
-by functions that count bytes.
+by functions that count bytes and raise an error beyond a limit.
 """
 
 import bz2
@@ -14,10 +14,10 @@ from typing import Any, ClassVar
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
-# A bag may be decompressed to FREE_BYTES, and to TIMES further bytes for each compressed byte.
+# A bag of n compressed bytes may have at most FREE_BYTES + TIMES * n bytes after decompression.
 FREE_BYTES = 1 << 26
 TIMES = 100
-_DECOMPRESSING = {  # modules that decompress, by the module that is imported
+_DECOMPRESSING = {  # modules whose decompression is replaced, by the module that is imported
     "rosbags.rosbag1": ("rosbags.rosbag1.reader",),
     "rosbags.rosbag2": ("rosbags.rosbag2.reader", "rosbags.rosbag2.storage_mcap"),
     "mcap.reader": ("mcap.stream_reader",),
@@ -82,7 +82,7 @@ def _bound(module: Any) -> None:
 
 
 def _remaining_bytes() -> int:
-    """Number of further bytes to which the current bag may be decompressed."""
+    """Number of bytes by which the decompressed size of the current bag may still grow."""
     return FREE_BYTES + TIMES * _Bag.packed - _Bag.unpacked
 
 
@@ -108,7 +108,7 @@ def _bounded_stream(open_stream: Callable[[BytesIO], Any]) -> Callable[..., byte
         _Bag.packed += len(data)
         limit = _remaining_bytes()
         with open_stream(BytesIO(data)) as file:
-            # One byte beyond the limit shows that there are too many.
+            # Reading one byte more than the limit shows whether the content exceeds it.
             return _count_unpacked(file.read(limit + 1), limit=limit)
 
     return decompress
@@ -117,7 +117,7 @@ def _bounded_stream(open_stream: Callable[[BytesIO], Any]) -> Callable[..., byte
 def _bounded_lz4(unbounded: Callable[..., bytes]) -> Callable[..., bytes]:
     """Function that decompresses LZ4 at once and counts the bytes afterwards.
 
-    LZ4 grows by a factor of at most 255, so a single call cannot fill the memory.
+    LZ4 expands data by a factor of at most 255, so a single call cannot fill the memory.
     """
 
     def decompress(data: bytes, *options: object) -> bytes:

@@ -1,4 +1,4 @@
-"""Messages of Foxglove in protobuf, converted to messages of ROS."""
+"""Conversion of Foxglove's protobuf messages to ROS messages."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -8,14 +8,15 @@ from gsmap.utils.extras import import_extra
 
 
 def foxglove_parser(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
-    """Create a function that parses a message of Foxglove, and converts it to one of ROS.
+    """Create a function that parses a Foxglove message, and converts it to a ROS message.
 
     Args:
-        name: Type of the messages, one of ``ROS_TYPES``.
-        descriptors: Descriptors of the type and its parts, from the schema of an MCAP file.
+        name: Foxglove's type of the messages, a key of ``ROS_TYPES``.
+        descriptors: Protobuf descriptors of the type and its parts, serialized, from the schema of
+            an MCAP file.
 
     Returns:
-        Function from the content of a message to an object with the fields of ROS.
+        Function that converts the bytes of a message to an object with the fields of the ROS type.
     """
     descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2", extra="bags")
     pool = import_extra("google.protobuf.descriptor_pool", extra="bags").DescriptorPool()
@@ -28,7 +29,7 @@ def foxglove_parser(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
 
 
 def _header(message: Any) -> Any:
-    """Header of ROS with the time and the frame of a message of Foxglove."""
+    """ROS header with the time and the frame of a Foxglove message."""
     stamp = SimpleNamespace(sec=message.timestamp.seconds, nanosec=message.timestamp.nanos)
     # Transforms have a parent frame instead of a frame.
     return SimpleNamespace(stamp=stamp, frame_id=getattr(message, "frame_id", ""))
@@ -77,7 +78,7 @@ def _transform(item: Any) -> Any:
     return SimpleNamespace(header=header, child_frame_id=item.child_frame_id, transform=transform)
 
 
-# ROS' type of a message and the function that converts it, by Foxglove's type.
+# ROS type of a message, and the function that converts the message, by Foxglove's type.
 _KINDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed_image),
     "foxglove.RawImage": ("sensor_msgs/msg/Image", _raw_image),
@@ -86,3 +87,4 @@ _KINDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "foxglove.FrameTransforms": ("tf2_msgs/msg/TFMessage", _transforms),
 }
 ROS_TYPES = {name: msgtype for name, (msgtype, _) in _KINDS.items()}
+"""ROS type of each Foxglove type that can be converted."""

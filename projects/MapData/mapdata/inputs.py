@@ -1,4 +1,4 @@
-"""Samples of any input: selects the reader for a file or a folder."""
+"""Reading of samples from any input, with the reader that suits the file or folder."""
 
 from pathlib import Path
 

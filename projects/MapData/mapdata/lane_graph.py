@@ -54,7 +54,7 @@ class LanePaths:
     once per map, so that the search in a frame takes about one step per lane.
 
     Args:
-        polylines: Points of each lane in the map frame, in metres, finite. each (n >= 2, 3)
+        polylines: Points of each lane in the map frame, in metres, finite. (n >= 2, 3) each
         links: Links of each lane, as `link_lanes` finds them.
 
     Raises:
@@ -139,7 +139,7 @@ class LanePaths:
     def _subgraph(self, lanes: Sequence[int]) -> dict[int, list[Edge]]:
         """Edges that leave each node in the graph of some lanes, in the order of the lanes."""
         members = set(lanes)
-        graph: dict[int, dict[Edge, None]] = {}  # inner dicts: ordered sets
+        graph: dict[int, dict[Edge, None]] = {}  # the inner dictionaries are used as ordered sets
         for lane in lanes:
             edges = list(self._edges[lane])
             for before, after, link in self._links[lane]:
@@ -153,7 +153,15 @@ class LanePaths:
 
 
 def _fold_points(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge]]:
-    """Edges of a lane between its ends and shared nodes, with its other points folded in."""
+    """Edges of a lane between its ends and the nodes that it shares; other points are on the edges.
+
+    Args:
+        nodes: Points of the lane, as indices.
+        uses: Number of vertices at each point of the map. (nodes,)
+
+    Returns:
+        Start node of each edge, and the edge.
+    """
     edges: list[tuple[int, Edge]] = []
     start = nodes[0]
     interior: list[int] = []
@@ -169,7 +177,7 @@ def _fold_points(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge
 
 
 def _next_edge(edges: Iterator[Edge], visited: set[int]) -> Edge | None:
-    """Next edge that leads to a node that is not visited, or None."""
+    """Take edges from an iterator up to the first one that ends at an unvisited node, or None."""
     for edge in edges:
         _, end = edge
         if end not in visited:

@@ -64,9 +64,8 @@ class LocalPatch:
             xmin=x0 - margin_m, ymin=y0 - margin_m, xmax=x1 + margin_m, ymax=y1 + margin_m
         )
 
-    # Products with the inverse (transposed) rotation are written out below: a matrix product may
-    # round equal points differently in different rows, and equal points must stay equal for lines
-    # to join.
+    # Products with the inverse (transposed) rotation are written out below. A matrix product may
+    # round equal points differently in different rows, and lines join only where points are equal.
     def points_to_local(self, points: Points) -> np.ndarray:
         """Transform points from the map to the patch's frame, in the plane. (n, 2+) -> (n, 2)"""
         x, y = (points[:, :2] - self.global_from_frame[:2, 3]).T
@@ -118,7 +117,8 @@ class GeometryLayer:
 
     def touching(self, patch: LocalPatch) -> np.ndarray:
         """Indices of the valid geometries that intersect the patch, ascending. (m,)"""
-        return np.sort(self._valid[self._tree.query(patch.polygon, predicate="intersects")])
+        found = self._tree.query(patch.polygon, predicate="intersects")  # indices into `_valid`
+        return np.sort(self._valid[found])
 
     def near(self, patch: LocalPatch) -> np.ndarray:
         """Valid geometries that intersect the patch, in their order. (m,)"""
@@ -188,7 +188,8 @@ class OutlineIndex:
         y_range = (y0 + margin_m, y1 - margin_m)
         pieces = []
         for ring_index in np.unique(self._owners[near]):
-            for run in self._runs(near[self._owners[near] == ring_index]):
+            chunks_of_ring = near[self._owners[near] == ring_index]
+            for run in self._runs(chunks_of_ring):
                 parts = [self._chunks[run[0]]]
                 for chunk in run[1:]:
                     parts.append(self._chunks[chunk][1:])  # chunks share a point

@@ -1,4 +1,4 @@
-"""MCAP files with messages of ROS 1, ROS 2 and Foxglove, also mixed in one file."""
+"""MCAP files with messages of ROS 1, ROS 2 and Foxglove, which may be mixed in one file."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,7 +23,7 @@ class McapConnection:
 
     Args:
         topic: Name of the topic.
-        msgtype: Type of the messages, named as in ROS 2 if it is one of ROS.
+        msgtype: Type of the messages. Types of ROS have their names of ROS 2.
         encoding: Serialization of the messages, such as ``cdr``.
         schema: Definition of the type as a record of ``mcap``; None without a definition.
     """
@@ -35,9 +35,13 @@ class McapConnection:
 
 
 def is_plain_ros2(path: Path) -> bool:
-    """Whether rosbags reads an MCAP file: it has messages of ROS 2 only, or is damaged.
+    """Whether the library rosbags can read an MCAP file, because it has messages of ROS 2 only.
 
-    rosbags then reports the damage.
+    The result is also True for a file that does not begin as an MCAP file or has no summary, so
+    that rosbags reports the fault.
+
+    Raises:
+        ValueError: If the header or the summary of the file is damaged.
     """
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -102,14 +106,18 @@ class McapBag:
     def messages(
         self, connections: Iterable[McapConnection]
     ) -> Iterator[tuple[McapConnection, int, bytes]]:
-        """Yield connection, time in nanoseconds and content of messages, file by file."""
+        """Yield the messages of some connections, file by file.
+
+        Yields:
+            Connection, time in nanoseconds and content of a message.
+        """
         selected = set(connections)
         topics = sorted({connection.topic for connection in selected})
         for path in self.paths:
             with path.open("rb") as file:
                 reader = import_bounded("mcap.reader").make_reader(file)
                 summary = reader.get_summary()
-                # without an index, sorting would hold all messages in memory
+                # Without an index, sorting by time would need all messages in memory.
                 has_index = summary is not None and bool(summary.chunk_indexes)
                 connection_of: dict[int, McapConnection] = {}
                 for schema, channel, message in reader.iter_messages(
@@ -133,11 +141,12 @@ class McapBag:
 
 
 def _read_channels(file: Any) -> tuple[dict[int, Any], dict[int, Any], dict[int, int]]:
-    """Channels and schemas of an MCAP file by their id, and the number of messages by channel."""
+    """Read the channels and schemas of a file by id, and the number of messages of each channel."""
     summary = import_bounded("mcap.reader").make_reader(file).get_summary()
     if summary is not None and summary.channels:
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         return summary.channels, summary.schemas, counts
+    # Without channels in a summary, all records of the file are read.
     records = import_extra("mcap.records", extra="bags")
     channels = {}
     schemas = {}
@@ -165,9 +174,9 @@ def _connection_of(channel: Any, schema: Any) -> McapConnection:
 
 
 def _listed_type(connection: McapConnection) -> str:
-    """Type of a connection for a listing.
+    """Type of the messages of a connection, for a list of topics.
 
-    The encoding is added unless it is one of ROS, or the type is one of Foxglove's (``ROS_TYPES``).
+    The encoding is added, except for encodings of ROS and types of Foxglove (``ROS_TYPES``).
     """
     name = connection.schema.name if connection.schema else "no type"
     is_known = connection.encoding in ("cdr", "ros1") or name in ROS_TYPES

@@ -1,4 +1,4 @@
-"""Options of the readers of recordings."""
+"""Options of the readers of recordings and of other inputs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class InputOptions:
-    """Options of the readers of inputs; each reader ignores options of other kinds of inputs.
+    """Options of the readers of inputs. Each reader ignores options for other kinds of inputs.
 
     Args:
         data_root: Folder that paths of an annotation or info file are relative to.
@@ -21,8 +21,7 @@ class InputOptions:
         vehicle_ground_z_m: Height of the road in that frame in metres; None is 0.
         topics: Topics of the images and of the camera info of a bag, by camera (``parse_topics``).
         calibration: Calibration file of a bag's cameras, in place of their camera info and
-            transforms. Each camera of the file gives its topic as ``images``, or is named as the
-            topic.
+            transforms. The topic of a camera is its entry ``images`` in the file, or its name.
         trained: Width, height, fx, fy, cx and cy of the cameras that a model was trained on, by
             name (``load_model(...).rig``). An image of a distorted camera with one of these names
             is rectified to the size and the intrinsics of that name.

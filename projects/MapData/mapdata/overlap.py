@@ -1,6 +1,6 @@
-"""Overlap of training and validation: distances of samples to the nearest training sample.
+"""Overlap of training and validation: distances of validation samples to training samples.
 
-``tools/create_data.py overlap`` reports and draws it.
+``tools/create_data.py overlap`` reports and draws the overlap.
 """
 
 import argparse
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # A validation sample overlaps with training if a training sample is within this distance.
 OVERLAP_DISTANCE_M = 5.0
 # Distances of the report. The maps of two samples, patches of 60 x 30 m, overlap up to a distance
-# of 30 m if they lie side by side, and of 60 m if they lie one behind the other.
+# of 30 m if they are side by side, and up to 60 m if one is behind the other.
 _DISTANCES_M = (5.0, 15.0, 30.0, 60.0)
 # Positions (x, y) of samples in metres, by split and by map name.
 Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
@@ -50,18 +50,18 @@ class Places:
     positions: np.ndarray
 
     def by_map(self) -> dict[str, np.ndarray]:
-        """Rows of the samples on each map, ascending, by its name."""
+        """Rows of the samples on each map in ascending order, by the name of the map."""
         return {str(name): np.flatnonzero(self.maps == name) for name in np.unique(self.maps)}
 
     def positions_by_map(self) -> dict[str, np.ndarray]:
-        """(x, y) of the samples on each map in metres, by its name. each (n, 2)"""
+        """(x, y) of the samples on each map in metres, by the name of the map. Each (n, 2)"""
         positions = {}
         for name, rows in self.by_map().items():
             positions[name] = self.positions[rows]
         return positions
 
     def select(self, rows: np.ndarray) -> "Places":
-        """Select samples by their rows, or by a mask. (m,) or (n,) bool"""
+        """Select samples by their row indices (m,), or by a mask (n,)."""
         return Places(
             tokens=self.tokens[rows],
             scenes=self.scenes[rows],
@@ -136,7 +136,7 @@ def overlap_share(train: _ByMap, val: _ByMap) -> float:
         val: (x, y) of the validation samples in metres, by map name. each (m, 2)
 
     Returns:
-        The share in [0, 1]; 0 without validation.
+        The share in [0, 1]; 0 if there are no validation positions.
     """
     distances = [distance for distance, _ in nearest_by_map(train, val).values()]
     if not distances:
@@ -145,7 +145,7 @@ def overlap_share(train: _ByMap, val: _ByMap) -> float:
 
 
 def overlap_notes(positions: Positions) -> list[str]:
-    """Warning about validation samples near a training sample; none if no sample is near."""
+    """List with a warning about validation samples near training samples; empty if none is near."""
     train = next((split for split in positions if split.endswith("train")), "")
     val = next((split for split in positions if split.endswith("val")), "")
     if not train or not val:
@@ -192,7 +192,8 @@ def draw_overlap(train: Places, val: Places, distance_m: np.ndarray) -> "Figure"
     Args:
         train: Positions of the training samples.
         val: Positions of the validation samples.
-        distance_m: Distance of each validation sample to training, in metres. (m,)
+        distance_m: Distance of each validation sample to the nearest training sample, in metres.
+            (m,)
 
     Returns:
         The figure.
@@ -245,7 +246,7 @@ def run(arguments: argparse.Namespace) -> str:
     if not len(val.tokens):
         raise InputError(f"{arguments.val} has no sample.")
     distance, nearest = sample_overlap(train, val)
-    common = len({*train.scenes} & {*val.scenes})
+    common = len({*train.scenes} & {*val.scenes})  # number of scenes in both
     lines = [f"{len(val.tokens)} samples against {len(train.tokens)}; {common} scenes are in both"]
     for limit_m in _DISTANCES_M:
         share = (distance <= limit_m).mean()

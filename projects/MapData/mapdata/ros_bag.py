@@ -40,9 +40,9 @@ def library_errors() -> Iterator[None]:
 
 
 class _AddressedPath(type(Path())):  # type: ignore[misc]
-    """Path that formats as part of an SQLite URI, with special characters escaped.
+    """Path whose special characters are escaped in formatted strings, as in an SQLite URI.
 
-    rosbags opens ``f"file:{path}"`` without this escape.
+    rosbags opens the URI ``f"file:{path}"`` and does not escape them.
     """
 
     def __format__(self, _: str) -> str:
@@ -52,7 +52,7 @@ class _AddressedPath(type(Path())):  # type: ignore[misc]
 class RosTypes:
     """Message types of a bag, created on demand.
 
-    A definition that contradicts others or cannot be parsed affects only its type.
+    If a definition contradicts another one or cannot be parsed, other types are not affected.
     """
 
     def __init__(self) -> None:
@@ -68,8 +68,8 @@ class RosTypes:
 
         Args:
             msgtype: Type of the messages, such as ``sensor_msgs/msg/Image``.
-            definition: Definition of the type in the bag. If it is empty, the type of ROS 2 Humble
-                is taken.
+            definition: Definition of the type in the bag. If it is empty, the definition of ROS 2
+                Humble is used.
             is_idl: Whether the definition is in IDL.
             is_ros1: Whether the messages are serialized as in ROS 1.
 
@@ -87,7 +87,7 @@ class RosTypes:
         return lambda content: deserialize(content, msgtype)
 
     def _store_with(self, msgtype: str, definition: str, is_idl: bool) -> Any:
-        """Store of types that has the types of a definition."""
+        """Return a type store of rosbags that contains the types of a definition."""
         if not definition:
             return _standard_store()
         if len(definition) > _MOST_LETTERS:
@@ -120,8 +120,8 @@ class RosTypes:
                 return 1
             if node == nodes.NAME:
                 return count_values_of_type(description)
-            # An array has a length. A sequence, which has any length, counts as one value, as does
-            # an array of numbers.
+            # A sequence, whose length varies, and an array of numbers count as one value. Other
+            # arrays have a fixed length and count the values of each item.
             (item_node, item_description), length = description
             values = count_values(item_node, item_description)
             if not values:
@@ -134,7 +134,8 @@ class RosTypes:
             if name not in known_types:
                 return 1  # rosbags raises an error for it
             if name not in counts:
-                counts[name] = 1  # ends the recursion of a type in itself, which rosbags refuses
+                # Ends the recursion if the type contains itself; rosbags rejects such a type.
+                counts[name] = 1
                 constants, fields = known_types[name]
                 values = sum(count_values(node, description) for _, (node, description) in fields)
                 counts[name] = values
@@ -228,7 +229,7 @@ class RosBag:
 
     def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
         """Yield connection, time in nanoseconds and content of messages, in order of time."""
-        # Connections are long tuples with the text of a definition: identities are compared.
+        # Connections are tuples with long texts (definitions), so their identities are compared.
         selected_ids = set(map(id, connections))
         streams = []
         for reader in self._readers:

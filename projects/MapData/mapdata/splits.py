@@ -24,7 +24,7 @@ class SplitList:
     Args:
         name: Name of the list.
         scenes: Names or tokens of scenes, by part.
-        complete: Whether the data set must have all scenes, so that results are comparable.
+        complete: Whether the data set must contain all scenes, so that results are comparable.
     """
 
     name: str
@@ -37,7 +37,7 @@ class SplitList:
         return list_identity(self.name, scenes=self.scenes)
 
     def missing_note(self, missing: Collection[str], total: int, where: str, allowed: bool) -> str:
-        """Note on missing scenes.
+        """Describe missing scenes in a note.
 
         Args:
             missing: Names or tokens of the missing scenes.
@@ -78,9 +78,9 @@ def split_names(dataset: str) -> tuple[str, ...]:
 def _read_family(name: str) -> Any:
     """Read a file of published lists.
 
-    It holds two entries for each data set. ``scenes`` lists the scenes of each group, by the name
-    of the group. ``splits`` lists the names of groups by the name of a split and by the part of
-    the split: ``{"splits": {SPLIT: {"train": [GROUP, ...], ...}}, "scenes": {GROUP: [...]}}``.
+    The file has two entries for each data set. ``scenes`` has the list of scenes of each group, by
+    the name of the group. ``splits`` has, for each split and each of its parts, the names of the
+    groups: ``{"splits": {SPLIT: {"train": [GROUP, ...], ...}}, "scenes": {GROUP: [...]}}``.
     """
     return read_json(Path(str(files("mapdata").joinpath(f"split_lists/{name}.json"))))
 
@@ -149,7 +149,7 @@ def _read_lines(path: Path) -> dict[str, list[str]]:
 
 
 def requested_split(options: Any, dataset: str) -> SplitList | None:
-    """Read the list that ``split_name`` or ``split_file`` of the options name.
+    """Read the split that is given by the option ``split_name`` or ``split_file``.
 
     Args:
         options: Options of a converter (``FileOptions``).
@@ -184,7 +184,7 @@ def resolve_scenes(
     Raises:
         ValueError: If a scene is in two parts, by its name or its token.
     """
-    # An entry of a list is the name or the token of a scene.
+    # Name of each scene, by its name and by its token, since an entry of a list may be either.
     name_of = {name: name for name in names.values()} | dict(names)
     part_of: dict[str, str] = {}
     missing = []

@@ -1,4 +1,4 @@
-"""Splits of scenes by place, in which validation keeps a distance from training."""
+"""Splits of scenes by place, in which validation samples keep a distance from training samples."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ def _near_scenes(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -
     """Find the pairs of scenes that have samples within a distance of each other.
 
     Args:
-        scenes: Index of the scene of each sample. (n,)
+        scenes: Index of the scene of each sample, in [0, S). (n,)
         positions: (x, y) of each sample in metres. (n, 2)
         distance_m: The distance in metres.
 

@@ -18,7 +18,7 @@ class ConversionSummary:
         instances: Number of map elements by class.
         problems: Number of omissions by their reason. Samples without any map element are counted
             here as well, although they are kept.
-        examples: First places of the omissions, by their reason.
+        examples: The first few places of the omissions, by their reason.
         notes: Further lines of the summary.
     """
 

@@ -8,7 +8,7 @@ import numpy as np
 
 _FROM_NS = 946_684_800 * 10**9  # the year 2000
 _TO_NS = 4_102_444_800 * 10**9  # the year 2100
-_UNITS_NS = (10**9, 10**6, 10**3, 1)
+_UNITS_NS = (10**9, 10**6, 10**3, 1)  # seconds, milliseconds, microseconds, nanoseconds
 
 
 def unix_time_ns(number: float, unit_ns: int | None = None) -> int | None:
@@ -27,7 +27,7 @@ def unix_time_ns(number: float, unit_ns: int | None = None) -> int | None:
     whole = round(number)
     units = _UNITS_NS if unit_ns is None else (unit_ns,)
     for unit in units:
-        # Integers are multiplied without rounding.
+        # A whole number is multiplied as an integer, which has no rounding error.
         time_ns = whole * unit if whole == number else round(number * unit)
         if _FROM_NS <= time_ns < _TO_NS:
             return time_ns
@@ -38,8 +38,8 @@ def in_nanoseconds(time: Any, usual_unit_ns: int) -> int:
     """Convert a time from a file to nanoseconds.
 
     Args:
-        time: A Unix time of any unit, or a time of another clock, as a number or a text.
-        usual_unit_ns: Unit of times of other clocks, in nanoseconds.
+        time: A Unix time in any unit, or a time of another clock, as a number or a text.
+        usual_unit_ns: Unit of the times of other clocks, in nanoseconds.
 
     Returns:
         The time in nanoseconds.
@@ -50,7 +50,7 @@ def in_nanoseconds(time: Any, usual_unit_ns: int) -> int:
 
 
 def span_of(times_ns: Iterable[int]) -> str:
-    """First and last of times in nanoseconds as text: in UTC, or in seconds of another clock."""
+    """Format the first and last of times in nanoseconds: in UTC, or in seconds of another clock."""
     times = list(times_ns)
     return f"{_text_of(min(times))} to {_text_of(max(times))}"
 

@@ -1,4 +1,4 @@
-"""Export of annotation files to JSON in MapTR's format, such as for ``tools/evaluate.py``."""
+"""Export of annotation files to JSON in MapTR's format, which ``tools/evaluate.py`` can read."""
 
 import argparse
 import json
@@ -22,7 +22,7 @@ _GROUND_TRUTH = "GTs"  # key of the samples in MapTR's format
 
 
 def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
-    """Name, time and pose of a sample; ``row`` is its row in a pose table, None without a table."""
+    """Name, time and pose of a sample. ``row`` is its row in the pose table of its log, or None."""
     pose = sample.global_from_frame
     if row is not None:
         return {
@@ -47,7 +47,7 @@ def write_vectors(annotations: Sequence[Path], target: Path) -> int:
 
     Args:
         annotations: Annotation files.
-        target: File to write; it appears once it is complete.
+        target: JSON file to write. It is created only when it is complete.
 
     Returns:
         Number of samples.
@@ -77,10 +77,10 @@ def write_vectors(annotations: Sequence[Path], target: Path) -> int:
 
 
 def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
-    """Yield the samples as JSON objects, with rows of the pose table if these are known."""
+    """Yield the samples as JSON objects, with their rows in the pose table if these are known."""
     match = re.fullmatch(r"poses:(\d+)", str(file.meta.options.get("at")))
     stride = int(match[1]) if match else None  # every N-th row is a sample
-    counts: Counter[str] = Counter()  # of samples by log
+    counts: Counter[str] = Counter()  # number of previous samples of each log
     for sample in file:
         if sample.instances is None:
             raise InputError(f"{file.path}: sample {sample.token!r} has no ground truth to export.")

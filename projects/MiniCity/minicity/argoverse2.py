@@ -1,4 +1,4 @@
-"""Ground of an Argoverse 2 log for MiniCity's renderer: road, kerbs, paint and height."""
+"""Ground of an Argoverse 2 log (one drive) for MiniCity's renderer."""
 
 from collections.abc import Sequence
 
@@ -35,7 +35,7 @@ Bounds = tuple[float, float, float, float]
 def make_scene(
     static_map: ArgoverseStaticMap, heights: GroundHeightLayer, bounds: Bounds
 ) -> SceneMap:
-    """Lay out the ground of a log from its map.
+    """Create the ground of a log from its map: road, kerbs, paint and height.
 
     Paint follows the lane markings and crossings of the map. A lane boundary without a marking gets
     no paint.
@@ -80,9 +80,9 @@ def make_scene(
 def lane_paint(
     static_map: ArgoverseStaticMap, window: shapely.Polygon
 ) -> dict[str, list[np.ndarray]]:
-    """Painted areas of the marked lane boundaries in a window of the city.
+    """Compute the painted areas of the marked lane boundaries in a window of the city.
 
-    Two lanes that share a line describe it twice; it is painted once.
+    If two lanes share a line, the map has the line twice, but it is painted once.
 
     Args:
         static_map: Map of the log.
@@ -106,7 +106,7 @@ def lane_paint(
 
 
 def _unique_lines(lines: np.ndarray, window: shapely.Polygon) -> list[int]:
-    """Indices of the lines in a window, without lines that repeat an earlier one."""
+    """Return the indices of the lines in a window, without lines that repeat an earlier line."""
     tree = shapely.STRtree(lines)
     unique: set[int] = set()
     for i in sorted(tree.query(window, predicate="intersects").tolist()):
@@ -121,7 +121,7 @@ def _unique_lines(lines: np.ndarray, window: shapely.Polygon) -> list[int]:
 
 
 def _line_paint(line: np.ndarray, kind: str) -> list[np.ndarray]:
-    """Painted areas of a line (n, 2) of an Argoverse mark type. Each (m, 2)"""
+    """Compute the painted areas of a line (n, 2) of an Argoverse mark type. (m, 2) each"""
     if kind.startswith("DOUBLE"):
         return double_line(line, LINE_WIDTH_M, gap_m=DOUBLE_GAP_M)
     if kind.startswith("DASHED"):
@@ -142,10 +142,10 @@ def _line_paint(line: np.ndarray, kind: str) -> list[np.ndarray]:
 def height_grid(
     heights: GroundHeightLayer, bounds: Bounds, trusted: shapely.Geometry
 ) -> HeightGrid:
-    """Smoothed ground height inside bounds, extended outwards from the edge of the road.
+    """Compute the smoothed ground height inside bounds.
 
-    Away from the road the stored heights include trees and buildings, up to tall spikes, so only
-    heights inside ``trusted`` are used.
+    Away from the road, the stored heights include trees, buildings and tall spikes. Therefore only
+    heights inside ``trusted`` are used. Every other cell gets the height of the nearest such cell.
 
     Args:
         heights: Ground height of a log.
@@ -168,7 +168,7 @@ def height_grid(
     low = np.clip(np.floor(corners[0]).astype(int), 0, (columns - 1, rows - 1))
     high = np.clip(np.ceil(corners[1]).astype(int), low + 1, (columns, rows))
     part = heights.array[low[1] : high[1], low[0] : high[0]].astype(np.float64)
-    # A point of the city is at p_grid = s (p_city + t), and the centre of cell i at i + 0.5.
+    # A point p_city has the grid coordinates s (p_city + t). The centre of cell i is at i + 0.5.
     origin = (low + 0.5) * cell_m - grid_from_city.t
     x = origin[0] + np.arange(part.shape[1]) * cell_m
     y = origin[1] + np.arange(part.shape[0]) * cell_m
@@ -184,5 +184,6 @@ def height_grid(
 
 
 def _polygons(geometry: shapely.Geometry) -> Sequence[shapely.Polygon]:
-    """Polygons among the parts of a geometry."""
-    return [p for p in shapely.get_parts(geometry).tolist() if p.geom_type == "Polygon"]
+    """Return the polygons among the parts of a geometry."""
+    parts = shapely.get_parts(geometry).tolist()
+    return [part for part in parts if part.geom_type == "Polygon"]

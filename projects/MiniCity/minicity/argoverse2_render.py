@@ -1,4 +1,7 @@
-"""Render the ring cameras of real Argoverse 2 logs, in the layout of the official data set."""
+"""Render synthetic images of the ring cameras for the maps and poses of Argoverse 2 logs.
+
+The images are written in the layout of the official data set.
+"""
 
 import argparse
 import os
@@ -32,8 +35,8 @@ from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer
 
 VIEW_M = 50.0  # distance from the track of the vehicle to the edges of the ground
-# Length of the ground in metres that has as many pixels as an image has columns. So wider images
-# get a finer ground: for images of 800 columns, a ground pixel has an edge of 6.25 cm.
+# Edge of a ground pixel in metres times the number of columns of an image. The product is constant,
+# so wider images get a finer ground: for 800 columns, a ground pixel has an edge of 6.25 cm.
 GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800
 JPEG_QUALITY = 90
 
@@ -69,8 +72,8 @@ class RenderOptions:
 def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int, int]:
     """Camera parameters for a scaled picture.
 
-    Integer pixel coordinates lie at pixel centres. Scaling therefore keeps the corner of the
-    picture, at (-0.5, -0.5), in place.
+    Integer pixel coordinates lie at pixel centres, so the corner of the picture is at (-0.5, -0.5).
+    Scaling keeps this corner in place.
 
     Args:
         camera: Camera of the log.
@@ -84,14 +87,14 @@ def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int,
     ratio = np.array([width / camera.width_px, height / camera.height_px])
     intrinsics = camera.intrinsics.K.copy()
     intrinsics[:2] *= ratio[:, None]  # focal lengths and principal point
-    intrinsics[:2, 2] += 0.5 * (ratio - 1)  # u + 0.5 is scaled, and not u
+    intrinsics[:2, 2] += 0.5 * (ratio - 1)  # u + 0.5 is scaled, not u
     return intrinsics, width, height
 
 
 def _make_photographer(
     log: Argoverse2Log, cameras: dict[str, PinholeCamera], times_ns: np.ndarray, scale: float
 ) -> Callable[[str, int], bytes]:
-    """Lay out the ground around a log's track and make a function that renders its pictures.
+    """Make the scene around the track of a log, and a function that renders its pictures.
 
     Args:
         log: The log.
@@ -188,7 +191,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
 
 
 def _copy_log(log_dir: Path, calibrated_log: Argoverse2Log, target: Path, scale: float) -> None:
-    """Copy map and poses, write the calibration of the scaled cameras, make the image folders.
+    """Copy map and poses, write the calibration of the scaled cameras, and make image folders.
 
     Args:
         log_dir: Folder of the log.
@@ -220,7 +223,7 @@ def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
     An unusable log is reported in the result. Other errors, such as a full disk, are raised.
 
     Returns:
-        Number of pictures, or the reason for which the log cannot be rendered.
+        Number of pictures, or the reason why the log cannot be rendered.
     """
     try:
         return render_log(log_dir, out / log_dir.name, options=options)

@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 from minicity.curves import Array
 
 RATE_HZ = 50  # messages per second
-STEP_S = 0.02  # the differences of a message use the poses this long before and after it
-GRAVITY = 9.81
+STEP_S = 0.02  # finite differences use the poses this long before and after a message
+GRAVITY = 9.81  # m / s^2
 
 
 def pose_messages(
     world_from_ego: Callable[[float], Array], start_us: int, duration_s: float
 ) -> list[dict[str, Any]]:
-    """``pose`` messages of a drive, from a tenth of a second before its start to its end.
+    """Create the ``pose`` messages of a drive, from 0.1 seconds before its start to its end.
 
     Args:
         world_from_ego: Function from a time in seconds to the pose of the car, in metres. (4, 4)

@@ -74,7 +74,7 @@ SIZE_OPTIONS = (
 
 
 def chosen_config(arguments: argparse.Namespace) -> MiniCityConfig:
-    """Configuration of the data set that the command line describes.
+    """Make the configuration of the data set from the options of the command line.
 
     Args:
         arguments: Parsed options of ``add_arguments``.
@@ -103,10 +103,11 @@ def chosen_config(arguments: argparse.Namespace) -> MiniCityConfig:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Generate the data set of the command line.
+    """Generate the data set that the command line describes.
 
     Args:
-        arguments: Parsed options of ``add_arguments``, and the command line as ``command``.
+        arguments: Parsed options of ``add_arguments``, and the text of the command line as
+            ``command``.
 
     Returns:
         Summary for the user: the folder, and the command that generated it.

@@ -25,10 +25,10 @@ class MiniCityConfig:
         seed: Seed of every random choice, >= 0.
         image_width: Width of the camera images in pixels, in [64, 3200].
         image_height: Height of the camera images in pixels, in [36, 1800].
-        samples_per_scene: Key frames per scene, half a second apart, in [1, 40].
-        sweeps_per_sample: LiDAR sweeps between two key frames, in [0, 9].
-        val_scenes: Validation scenes among ``scenes``; None takes a fifth, at least one.
-        passes: Number of times that every scene is driven, in [1, 20].
+        samples_per_scene: Number of key frames per scene, half a second apart, in [1, 40].
+        sweeps_per_sample: Number of LiDAR sweeps between two key frames, in [0, 9].
+        val_scenes: Number of validation scenes among ``scenes``; None takes a fifth, at least one.
+        passes: Number of drives (passes) through every scene, in [1, 20].
         repainted: Share of the streets that are repainted between two passes, in [0, 1].
         new_passes: Number of passes after the repainting, at least 1, and at most ``passes - 1`` if
             there are several passes.
@@ -94,18 +94,18 @@ class MiniCityConfig:
 
     @property
     def num_val(self) -> int:
-        """Number of validation scenes, each counted once."""
+        """Number of validation scenes. The passes of a scene count once."""
         return self.val_scenes if self.val_scenes is not None else max(1, self.scenes // 5)
 
     @property
     def num_train(self) -> int:
-        """Number of training scenes, each counted once."""
+        """Number of training scenes. The passes of a scene count once."""
         return self.scenes - self.num_val
 
     def as_dict(self) -> dict:
-        """All values as JSON-ready fields, with the format version of the generator.
+        """All values and the format version of the generator, as a dictionary for JSON.
 
-        The fields ``passes``, ``repainted`` and ``new_passes`` are left out at their defaults.
+        ``passes``, ``repainted`` and ``new_passes`` are left out if they have their default values.
         """
         values = {"format": FORMAT, **asdict(self), "val_scenes": self.num_val}
         for name in ("passes", "repainted", "new_passes"):
@@ -130,13 +130,13 @@ PRESETS = {
 """Data sets of the published comparisons.
 
 ``protocol_s`` has 1,600 training and 400 validation samples. ``protocol_s_test`` has 500 validation
-samples in a town of another seed. It serves for one final test of each model: no recipe, weight or
-epoch may be chosen by it. Its single training scene exists because the format needs one.
+samples in a town of another seed. It is for one final test of each model: no recipe, weight or
+epoch may be chosen by it. It has a single training scene because the format requires one.
 """
 
 
 def _digest(parts: tuple) -> bytes:
-    """Hash of some values, 16 bytes."""
+    """Hash of 16 bytes of some values, converted to text."""
     text = "|".join(map(str, parts))
     return hashlib.blake2b(text.encode(), digest_size=16).digest()
 

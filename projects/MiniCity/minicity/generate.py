@@ -54,7 +54,8 @@ LOGGER = logging.getLogger(__name__)
 def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
     """Name the scenes after the official split and distribute them among the towns.
 
-    A pass drives along every street once. Its scenes come before the scenes of the next pass.
+    In each pass, every street is driven once. The scenes of a pass come before the scenes of the
+    next pass.
     """
     from nuscenes.utils import splits
 
@@ -101,7 +102,7 @@ def generate(
     ``root``, which is renamed to ``root`` when it is complete.
 
     Args:
-        root: Output folder. A folder that holds this data set already is left as it is.
+        root: Output folder. A folder that already contains this data set is not changed.
         scenes: Number of scenes, training and validation together, >= 2.
         seed: Seed of every random choice, >= 0.
         image_size: Width and height of the pictures in pixels.
@@ -111,7 +112,7 @@ def generate(
         passes: Number of times that every scene is driven, at other hours and in other weather and
             traffic; the data set has ``scenes * passes`` scenes.
         repainted: Share of the streets that are repainted before the new passes, in [0, 1].
-        new_passes: Number of passes after the repainting, the last ones.
+        new_passes: Number of passes after the repainting. These are the last passes.
         workers: Number of processes; None takes one per core, 0 or 1 works in this process.
         progress: Whether to show a progress bar.
 
@@ -149,7 +150,7 @@ def generate(
 
 
 def is_complete(root: Path, config: MiniCityConfig) -> bool:
-    """Whether ``root`` holds exactly the data set of ``config``.
+    """Whether ``root`` contains exactly the data set of ``config``.
 
     Args:
         root: Folder of the data set.
@@ -168,7 +169,8 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
             raise InputError(f"{marker} is another program's file: choose another --root.")
         parts = []
         for key in sorted({*present, *requested}):
-            default = getattr(MiniCityConfig, key, None)  # some fields are left out at the default
+            # Some fields with the default value are left out of the marker.
+            default = getattr(MiniCityConfig, key, None)
             found = present.get(key, default)
             wanted = requested.get(key, default)
             if found != wanted:
@@ -191,28 +193,29 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
 def _partial_folder(root: Path) -> Iterator[Path]:
     """Create and lock a folder beside ``root`` for writing, and delete it if writing fails."""
     root.parent.mkdir(parents=True, exist_ok=True)
-    partial = root.with_name(f"{root.name}{SUFFIX}")
-    require_no_link(partial)
-    partial.mkdir(exist_ok=True)
-    handle = os.open(partial, os.O_RDONLY | os.O_NOFOLLOW)
+    folder = root.with_name(f"{root.name}{SUFFIX}")
+    require_no_link(folder)
+    folder.mkdir(exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW)
     try:
-        # None on a disk without locks. There, a folder with files may be in use by another process.
+        # `locked` is None on a disk without locks. There, a folder with files may be in use by
+        # another process.
         locked = try_lock(handle)
-        is_used = locked is False or (locked is None and any(partial.iterdir()))
+        is_used = locked is False or (locked is None and any(folder.iterdir()))
         if is_used:
             raise WorkError(
-                f"another process is generating into {partial}: wait for its end. If there is no "
+                f"another process is generating into {folder}: wait for its end. If there is no "
                 "other process, and this disk has no locks, remove that folder."
             )
         try:
-            for leftover in partial.iterdir():
+            for leftover in folder.iterdir():
                 if leftover.is_dir() and not leftover.is_symlink():
                     shutil.rmtree(leftover)
                 else:
                     leftover.unlink()
-            yield partial
+            yield folder
         except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
             raise
     finally:
         os.close(handle)
@@ -353,7 +356,7 @@ def _make_scene(
     root: Path, config: MiniCityConfig, towns: dict[str, Town], task: SceneTask
 ) -> Records:
     """Make a scene in this process."""
-    if parent_process() is not None:  # one of several workers, each of one thread
+    if parent_process() is not None:  # this is one of several workers, which use one thread each
         cv2.setNumThreads(1)
     maker = SceneMaker(config, task, town=towns[task.expansion], root=root)
     return maker.make()

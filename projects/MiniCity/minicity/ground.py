@@ -18,7 +18,7 @@ from minicity.terrain import Footprints, make_terrain, terrain_footprints
 from minicity.texture import GroundTexture, Image
 
 MAX_SAMPLES = 8  # largest number of samples per image row
-HORIZON_EPS = 1e-4  # rays that fall less than this are above the horizon
+HORIZON_EPS = 1e-4  # a ray whose vertical part is not below -HORIZON_EPS is above the horizon
 Color = tuple[float, float, float]
 
 
@@ -102,8 +102,8 @@ def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> 
     Returns:
         Bands from the top of the image to its bottom.
     """
-    # Texture pixels should be as large as the footprint is wide, and so large that `MAX_SAMPLES` of
-    # them cover its length. By the factor 1.2, they may be up to 20 percent larger.
+    # A texture pixel should be as large as the footprint is wide, and `MAX_SAMPLES` texture pixels
+    # should cover the length of the footprint. The factor 1.2 allows 20 percent larger pixels.
     target = np.maximum(footprints.across, footprints.along / MAX_SAMPLES)
     fit = np.floor(np.log2(np.maximum(target / resolution_m, 1.0) * 1.2))
     levels = np.clip(fit, 0, num_levels - 1).astype(int)
@@ -119,7 +119,7 @@ def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> 
             is_adjacent = last.stop == row
             is_equal = (last.level, last.samples) == (level, count)
             if is_adjacent and is_equal:
-                bands.pop()  # the band goes on with this row
+                bands.pop()  # replaced below by a band that includes this row
                 start = last.start
         bands.append(Band(start, row + 1, level=level, samples=count))
     return bands

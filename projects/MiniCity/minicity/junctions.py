@@ -17,9 +17,9 @@ class Junction:
 
     Attributes:
         node: Index of the node.
-        outline: Kerb outline and road mouths in metres, anticlockwise. (n, 2)
+        outline: Closed outline of kerbs and road mouths in metres, anticlockwise. (n, 2)
         corners: Kerb lines between neighbouring roads, in metres. Each (m, 2)
-        arms: (road index, whether the road starts here), anticlockwise.
+        arms: Index of each road, and whether the road starts here; anticlockwise.
     """
 
     node: int
@@ -35,7 +35,7 @@ class Connector:
     Attributes:
         source: Lane that leads to the junction.
         target: Lane that leaves the junction.
-        center: Path between both lanes, in metres. (n, 2)
+        center: Centre line of the path between the two lanes, in metres. (n, 2)
     """
 
     source: Lane
@@ -46,7 +46,7 @@ class Connector:
 def mouth(road: Road, at_start: bool) -> Array:
     """Mouth of a road: its cross-section where it meets a junction.
 
-    Points go from the right to the left kerb, for a driver who leaves the junction along the road.
+    The points go from the right kerb to the left kerb, as seen by a driver who leaves the junction.
 
     Args:
         road: The road.
@@ -85,8 +85,8 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
     ring = []
     for i in range(len(arms)):
         j = (i + 1) % len(arms)
-        # The corner leads from the left kerb of road i, into the junction, and to the right kerb of
-        # the next road. The sharper the turn, the longer are the tangents at its ends (`pull`).
+        # The corner leads from the left kerb of road i, along the junction, to the right kerb of
+        # road j. The tangents at its ends (`pull`) are longer for sharper turns.
         turn_rad = float(np.arccos(np.clip(-outward[i] @ outward[j], -1, 1)))
         corner = hermite(
             start=mouths[i][-1],
@@ -103,6 +103,7 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
 
 def _turning_angle(source: Lane, target: Lane) -> float:
     """Angle in radians from the end of one lane to the start of another, positive to the left."""
+    # The signed angle is the arctangent of the cross product over the dot product.
     a = source.center[-1] - source.center[-2]
     b = target.center[1] - target.center[0]
     return float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
@@ -113,17 +114,18 @@ def _choose_target(source: Lane, lanes_in: int, targets: list[Lane]) -> Lane | N
 
     Args:
         source: Lane that leads to the junction.
-        lanes_in: Number of lanes beside ``source`` in its direction, itself included.
-        targets: Lanes that leave the junction on one road, from the innermost.
+        lanes_in: Number of lanes of the road of ``source`` in its direction, including ``source``.
+        targets: Lanes of one road that leave the junction, the innermost one first.
 
     Returns:
-        The lane. None if drivers make this turn from another lane than ``source``.
+        The lane, or None if drivers make this turn from another lane than ``source``.
     """
     angle = _turning_angle(source, targets[0])
     if angle > STRAIGHT_RAD:  # a left turn, from the innermost lane to the innermost one
         return targets[0] if source.index == 0 else None
     if angle < -STRAIGHT_RAD:  # a right turn, from the outermost lane to the outermost one
         return targets[-1] if source.index == lanes_in - 1 else None
+    # Straight on, into the lane with the index of `source` or else into the outermost lane.
     return targets[min(source.index, len(targets) - 1)]
 
 
@@ -141,7 +143,7 @@ def make_connectors(junction: Junction, lanes_by_road: dict[int, list[Lane]]) ->
     outgoing: dict[int, list[Lane]] = {}
     for r, at_start in junction.arms:
         for lane in lanes_by_road[r]:
-            # Forward lanes lead away from a junction at the start of the road.
+            # Forward lanes lead away from the junction if it is at the start of the road.
             is_incoming = lane.forward != at_start
             lanes = incoming if is_incoming else outgoing
             lanes.setdefault(r, []).append(lane)

@@ -1,4 +1,4 @@
-"""Spinning LiDAR: rays against flat ground, vehicles and buildings."""
+"""Simulation of a spinning LiDAR, whose rays hit flat ground, vehicles and buildings."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,22 +8,23 @@ from minicity.texture import GroundTexture
 from minicity.vehicles import Vehicle
 
 BEAMS = 32
-COLUMNS = 720
-LOWEST_RAD, HIGHEST_RAD = np.deg2rad(-30.0), np.deg2rad(9.0)
+COLUMNS = 720  # azimuth angles of a revolution
+LOWEST_RAD = np.deg2rad(-30.0)  # elevation of the lowest beam
+HIGHEST_RAD = np.deg2rad(9.0)
 RANGE_M = 75.0
-_NEAREST_M = 0.3  # nearer hits do not count
-RANGE_NOISE_M = 0.015
+_NEAREST_M = 0.3  # hits at smaller distances do not count
+RANGE_NOISE_M = 0.015  # standard deviation
 
 
 def footprint_array(footprints: list[Array], heights: list[float]) -> Array:
-    """Pack boxes, given by rectangles on the ground and heights, into rows.
+    """Pack boxes into one array. A box is a rectangle on the ground with a height.
 
     Args:
         footprints: Corners x, y of each rectangle in metres. Each (4, 2)
         heights: Height of each box in metres.
 
     Returns:
-        Four corners, then the height. (n, 9)
+        x, y of the four corners, then the height, of each box in metres. (n, 9)
     """
     rows = []
     for footprint, height in zip(footprints, heights, strict=True):
@@ -56,21 +57,23 @@ def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:
 
     Args:
         origin: Start of all rays in metres. (2,)
-        directions: Unit directions. (A, 2)
-        boxes: Four corners and a height per box, in metres. (n, 9)
+        directions: Unit directions of the A rays. (A, 2)
+        boxes: x, y of the four corners, then the height, of each box in metres. (n, 9)
 
     Returns:
         Distances in metres, inf where a ray misses the rectangle. (A, n)
     """
-    start = boxes[:, :8].reshape(-1, 4, 2) - origin  # corners, from which the edges start
-    edge = np.roll(start, -1, axis=1) - start  # to the next corner. (n, 4, 2)
+    # An edge starts at a corner and leads to the next corner. (n, 4, 2) each
+    start = boxes[:, :8].reshape(-1, 4, 2) - origin
+    edge = np.roll(start, -1, axis=1) - start
     dx = directions[:, 0, None, None]
     dy = directions[:, 1, None, None]
     direction_cross_edge = dx * edge[None, ..., 1] - dy * edge[None, ..., 0]
     is_parallel = np.abs(direction_cross_edge) < 1e-12
     direction_cross_edge = np.where(is_parallel, 1e-12, direction_cross_edge)
     # A ray meets the line of an edge where reach * direction = start + share * edge. The cross
-    # product of both sides with the edge gives `reach`, with the direction it gives `share`.
+    # product of both sides with the edge gives `reach`. The cross product with the direction gives
+    # `share`.
     start_cross_edge = (
         start[None, ..., 0] * edge[None, ..., 1] - start[None, ..., 1] * edge[None, ..., 0]
     )
@@ -118,7 +121,8 @@ def scan(
     box = box[order]
     distance = entry[column, box]
     height = origin[2] + slope[:, None] * distance  # of each beam at each hit. (BEAMS, hits)
-    # A ray above the ground, z = 0, at the box has not met the ground: the box is nearer.
+    # A ray hits a box if its height at the box is between 0 and the height of the box. It is still
+    # above the ground, z = 0, so the box is nearer than the ground.
     rows, hit = np.nonzero((height > 0) & (height < near[box, 8]))
     reach[rows, column[hit]] = distance[hit]
     hit_box[rows, column[hit]] = box[hit]
@@ -129,12 +133,13 @@ def scan(
     world_z = origin[2] + slope[rows] * distance
     world = np.column_stack([world_xy, world_z])
     point_box = hit_box[rows, columns]
-    # Intensity of each box. The additional last entry is read by index -1 of points on the ground,
-    # whose value `np.where` drops.
+    # Intensity of each box. Points on the ground have the index -1 and read the additional last
+    # entry, which `np.where` replaces by the intensity of the ground.
     tint = 18.0 + 7.0 * (np.arange(len(near) + 1) % 9)
     ground_intensity = texture.sample_reflectivity(world[:, :2]).astype(float)
     intensity = np.where(point_box >= 0, tint[point_box], ground_intensity)
     intensity = intensity + rng.normal(loc=0, scale=2.0, size=len(rows))
-    local_points = (world - origin) @ world_from_lidar[:3, :3]  # rows @ R: the inverse rotation
+    # The points are row vectors, so multiplying by R from the right applies the inverse rotation.
+    local_points = (world - origin) @ world_from_lidar[:3, :3]
     cloud = np.column_stack([local_points, np.clip(np.round(intensity), 0, 255), rows])
     return cloud.astype(np.float32)

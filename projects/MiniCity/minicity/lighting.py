@@ -23,8 +23,8 @@ VEILED_ELEVATION_RAD = 0.3  # elevation of a sun behind clouds
 
 SKY_CURVE = 0.6  # an exponent below 1 lets the colour change fastest just above the horizon
 WET_SLOPE = 0.12  # slope of the line of sight at which the mirroring drops to 1 / e
-LEAST_VEIL = 0.02  # weaker haze is left out
-NEAREST_GROUND_M = 0.1  # lower limit of the distances by which the slope is computed
+LEAST_VEIL = 0.02  # rows with a smaller share of the sky's colour are not changed
+NEAREST_GROUND_M = 0.1  # smaller distances are raised to this value when the slope is computed
 
 NOISE_PX = 1024  # edge of the noise tile
 NOISE_SEED = 7
@@ -48,7 +48,7 @@ class Lighting:
         gain: Exposure factor per colour channel.
         sky_top: Colour of the sky overhead, in [0, 255].
         haze: Colour of the sky at the horizon and of distant objects, in [0, 255].
-        haze_m: Distance in metres at which haze hides 63 %.
+        haze_m: Distance in metres at which haze hides 63 % (1 - 1 / e) of an object's colour.
         wet: Share of the sky mirrored by the road at a grazing angle, in [0, 1].
         noise: Standard deviation of the sensor noise in grey levels.
         streaks: Number of rain streaks per image.
@@ -68,7 +68,8 @@ class Lighting:
     streaks: int
 
 
-# Frequency of each weather, and its fields of `Lighting`: one column per weather.
+# Kinds of weather, their probabilities, and their values of fields of `Lighting`, in the order of
+# WEATHERS.
 WEATHERS = ("clear", "cloudy", "dusk", "rain")
 SHARES = (0.5, 0.24, 0.13, 0.13)
 _LOOKS: dict[str, tuple[Any, ...]] = {
@@ -171,7 +172,7 @@ def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
     Returns:
         The finished picture, BGR. (H, W, 3)
     """
-    # New value of each value of a pixel, for each colour channel. (256, 3)
+    # Lookup table: the new value for each value of a colour channel. (256, 3)
     table = np.clip(np.arange(256)[:, None] * np.array(lighting.gain), 0, 255).astype(np.uint8)
     image = cv2.LUT(image, np.ascontiguousarray(table[:, None]))  # OpenCV takes (256, 1, 3)
     if lighting.streaks:
@@ -179,7 +180,7 @@ def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
     rows, columns = image.shape[:2]
     # The noise of a picture is a random part of a fixed tile, which repeats for large pictures.
     tile = _sensor_noise(lighting.noise)
-    room = (max(1, NOISE_PX - rows), max(1, NOISE_PX - columns))
+    room = (max(1, NOISE_PX - rows), max(1, NOISE_PX - columns))  # number of possible corners
     top, left = rng.integers(0, room).tolist()
     bottom = top + rows
     right = left + columns
@@ -200,7 +201,7 @@ def _unit_noise() -> NDArray[np.float32]:
 
 @lru_cache(maxsize=8)
 def _sensor_noise(deviation: float) -> NDArray[np.int16]:
-    """Fixed tile of noise of a standard deviation in grey levels. (NOISE_PX, NOISE_PX, 3)"""
+    """Fixed tile of noise, scaled by ``deviation`` to grey levels. (NOISE_PX, NOISE_PX, 3)"""
     return np.round(_unit_noise() * deviation).astype(np.int16)
 
 

@@ -98,7 +98,7 @@ class MapWriter:
         return token
 
     def as_dict(self) -> dict[str, Any]:
-        """Whole map as a JSON-ready dictionary."""
+        """Whole map as a dictionary that can be written as JSON."""
         return {
             "version": "1.3",
             "canvas_edge": [self.town.size_m, self.town.size_m],
@@ -121,7 +121,7 @@ class MapWriter:
         self._add_block(road, road.backward_edges, segment=segment, direction="backward")
         for start, end in divider_pieces(road):
             if road.has_center_line:
-                # The offset of the centre line is 0, to which the shift of painted lines is added.
+                # The centre line has the offset 0 plus the shift of all painted lines.
                 center = self.line(road.line(road.shift_m, start, end_m=end))
                 self.add("road_divider", line_token=center, road_segment_token=segment)
             for offset in lane_divider_offsets(road):
@@ -139,7 +139,14 @@ class MapWriter:
         self._add_stop_line(road, road.stop_backward, road.backward_edges)
 
     def _add_block(self, road: Road, edges: list[float], segment: str, direction: str) -> None:
-        """Add the block of the lanes of one direction, given their edges in metres."""
+        """Add the block of the lanes of one direction.
+
+        Args:
+            road: Road of the lanes.
+            edges: Offsets of the edges of the lanes from the centre line in metres.
+            segment: Token of the road segment.
+            direction: ``forward`` or ``backward``.
+        """
         if len(edges) < 2:
             return
         band = Polygon(road.band(min(edges), max(edges)))
@@ -155,7 +162,13 @@ class MapWriter:
     def _add_stop_line(
         self, road: Road, stop: tuple[float, float] | None, edges: list[float]
     ) -> None:
-        """Add the stop line between two arc lengths, if any, across lanes with edges in metres."""
+        """Add the stop line of one direction, if any.
+
+        Args:
+            road: Road of the stop line.
+            stop: Arc lengths in metres between which the stop line is; None for no stop line.
+            edges: Offsets of the edges of the lanes from the centre line in metres.
+        """
         if stop is None:
             return
         start, end = stop

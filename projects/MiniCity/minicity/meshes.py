@@ -25,7 +25,7 @@ Color = tuple[float, float, float]  # BGR in [0, 255]
 
 @dataclass
 class Mesh:
-    """Quads and discs, grouped by object. ``freeze`` converts them to arrays.
+    """Lists of quads and discs, grouped by object. ``freeze`` converts them to arrays.
 
     Coordinates are in metres in the world frame.
 
@@ -34,7 +34,7 @@ class Mesh:
         colors: Colour of each quad in full light, BGR in [0, 255].
         groups: Index of the object of each quad.
         layers: Drawing order of each quad inside its object; higher layers cover lower ones.
-        glow: Whether each quad is bright without light from outside, like a lit window.
+        glow: Whether each quad shines without light on it, like a lit window.
         discs: (x, y, z, radius) of each disc; discs always face the camera.
         disc_colors: Colour of each disc in full light, BGR in [0, 255].
         disc_groups: Index of the object of each disc.
@@ -91,7 +91,7 @@ class Mesh:
         self.disc_groups.append(len(self.anchors) - 1)
 
     def freeze(self) -> "FrozenMesh":
-        """Copy of all quads and discs as arrays."""
+        """Copy all quads and discs to arrays."""
         return FrozenMesh(
             quads=np.array(self.quads, dtype=float).reshape(-1, 4, 3),
             colors=np.array(self.colors, dtype=float).reshape(-1, 3),
@@ -153,7 +153,7 @@ def merge(first: FrozenMesh, second: FrozenMesh) -> FrozenMesh:
 
 
 def prism_faces(base: Array, low_m: float, high_m: float, top_scale: float = 1.0) -> Array:
-    """Side and top faces of a prism over a rectangle, anticlockwise from outside.
+    """Compute the side and top faces of a prism over a rectangle, anticlockwise from outside.
 
     Args:
         base: Corners of the rectangle in metres, anticlockwise. (4, 2)
@@ -173,7 +173,7 @@ def prism_faces(base: Array, low_m: float, high_m: float, top_scale: float = 1.0
 
 
 def patches(face: Array, left: Array, right: Array, bottom: Array, top: Array) -> Array:
-    """Rectangular parts of a quad.
+    """Compute rectangular parts of a quad.
 
     Args:
         face: Corners: bottom left, bottom right, top right, top left, in metres. (4, 3)
@@ -194,7 +194,7 @@ def patches(face: Array, left: Array, right: Array, bottom: Array, top: Array) -
 
 
 def patch(face: Array, left: float, right: float, bottom: float, top: float) -> Array:
-    """Rectangular part of a quad.
+    """Compute one rectangular part of a quad.
 
     Args:
         face: Corners: bottom left, bottom right, top right, top left, in metres. (4, 3)
@@ -232,7 +232,8 @@ def add_building(mesh: Mesh, building: Building, lit_windows: bool = False) -> N
     for wall in walls:
         mesh.add_quad(wall, building.color)
         columns = max(1, int(np.linalg.norm(wall[1] - wall[0]) / WINDOW_PITCH_M))
-        storey, column = np.mgrid[:storeys, :columns].reshape(2, -1)  # of each window
+        # Storey and column of each window.
+        storey, column = np.mgrid[:storeys, :columns].reshape(2, -1)
         windows = patches(
             wall,
             left=(column + 0.25) / columns,
@@ -259,7 +260,8 @@ def add_tree(mesh: Mesh, tree: Array, ground_z_m: float = 0.0) -> None:
     for side in prism_faces(trunk, low_m=ground_z_m, high_m=trunk_top)[:4]:  # without the top
         mesh.add_quad(side, BARK)
     radius = 0.24 * height
-    shade = 0.8 + 0.05 * (int(x * 10) % 7)  # from the position, so that neighbours differ
+    # The shade depends on the position, so that neighbouring trees differ.
+    shade = 0.8 + 0.05 * (int(x * 10) % 7)
     for dx, dy, dz, tone in CROWN:
         above = 0.68 * height + radius * dz
         spot = np.array([x + radius * dx, y + radius * dy, ground_z_m + above])

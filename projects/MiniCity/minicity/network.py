@@ -1,4 +1,4 @@
-"""Street network of a town: jittered grid nodes joined by curved roads."""
+"""Street network of a town: randomly shifted nodes of a grid, joined by curved roads."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from minicity.config import make_rng
 from minicity.curves import Array, arc_lengths, hermite, resample, subline, unit
 from minicity.roads import CrossSection, Road, RoadStyle
 
-PITCH_M = 115.0  # distance of neighbouring grid nodes before their random offsets
+PITCH_M = 115.0  # distance of neighbouring grid nodes before the random offsets are added
 MARGIN_M = 130.0  # distance of the grid from the border of the canvas
 STATION_M = 3.0  # distance of the points of a centre line
 MIN_ROAD_M = 40.0  # shorter roads have no crossings and no stop lines
@@ -22,10 +22,13 @@ STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 class Node:
     """Node of the grid, at which streets meet or bend.
 
+    A node has four arms, which are possible streets in the directions 0, 90, 180 and 270 degrees
+    plus the rotation ``turn_rad``.
+
     Attributes:
         position: Centre in metres. (2,)
         turn_rad: Rotation of the four arms from the axes, in radians.
-        neighbours: Node index per arm, at 0, 90, 180, 270 degrees plus the rotation, or None.
+        neighbours: Index of the next node for each arm, or None for an arm without a street.
     """
 
     position: Array
@@ -38,7 +41,7 @@ class Node:
         return sum(n is not None for n in self.neighbours)
 
     def arm_dir(self, arm: int) -> Array:
-        """Unit direction in which an arm leaves. (2,)"""
+        """Return the unit direction of an arm, away from the node. (2,)"""
         return unit(self.turn_rad + arm * np.pi / 2)
 
 
@@ -74,7 +77,7 @@ def _remove_streets(nodes: list[Node], rng: np.random.Generator) -> None:
     """Remove random streets in place; each node keeps at least two."""
     streets = []
     for i, node in enumerate(nodes):
-        for arm in (0, 1):  # arms 2 and 3 are the streets of other nodes
+        for arm in (0, 1):  # arms 2 and 3 are arm 0 or 1 of a neighbour
             if node.neighbours[arm] is not None:
                 streets.append((i, arm))
     for k in rng.permutation(len(streets)):
@@ -83,7 +86,7 @@ def _remove_streets(nodes: list[Node], rng: np.random.Generator) -> None:
         assert other is not None
         if min(nodes[i].degree, nodes[other].degree) > 2 and rng.random() < 0.2:
             nodes[i].neighbours[arm] = None
-            nodes[other].neighbours[(arm + 2) % 4] = None  # the street from its other end
+            nodes[other].neighbours[(arm + 2) % 4] = None  # the other end of the street
 
 
 def random_section(rng: np.random.Generator) -> CrossSection:
@@ -155,7 +158,7 @@ class Chain:
 
 
 def _curve_to_neighbour(nodes: list[Node], index: int, arm: int) -> Array:
-    """Curve from a node along one of its arms to the next node, in metres. (60, 2)"""
+    """Create the curve from a node along one of its arms to the next node, in metres. (60, 2)"""
     node = nodes[index]
     other_index = node.neighbours[arm]
     assert other_index is not None
@@ -170,7 +173,7 @@ def _curve_to_neighbour(nodes: list[Node], index: int, arm: int) -> Array:
 
 
 def _join_at_bend(first: Array, second: Array) -> Array:
-    """Join two curves (n, 2) and (m, 2) that meet at a node by a wide bend. (k, 2)"""
+    """Join two curves, which meet at a node, by a wide bend. (n, 2) and (m, 2) -> (k, 2)"""
     first_length = arc_lengths(first)[-1]
     second_length = arc_lengths(second)[-1]
     head = subline(first, start_m=0.0, end_m=first_length - BEND_CUT_M)
@@ -240,10 +243,10 @@ def _follow_street(nodes: list[Node], start: int, arm: int, rng: np.random.Gener
 
 
 def _half_widths(chain: Chain, at_start: bool) -> tuple[float, float]:
-    """Distances of the left and the right kerb from the centre line, in metres.
+    """Return the distances of the left and the right kerb from the centre line, in metres.
 
-    Left and right are meant for a driver who leaves the junction. At the end of the street, this is
-    against the centre line, so the sides of the section are exchanged.
+    Left and right are the sides for a driver who leaves the junction. At the end of the street, the
+    driver goes against the direction of the centre line, so the sides are exchanged.
     """
     left = chain.section.left_m
     right = -chain.section.right_m  # offsets to the right are negative
@@ -251,7 +254,7 @@ def _half_widths(chain: Chain, at_start: bool) -> tuple[float, float]:
 
 
 def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> list[float]:
-    """Distance from the centre of a junction at which each of its roads ends.
+    """Compute the distance from the centre of a junction at which each of its roads ends.
 
     The kerbs between two neighbouring roads meet at ``(w2 + w1 cos(phi)) / sin(phi)`` along the
     first road. Here ``phi`` is the angle between the roads, and ``w1`` and ``w2`` are the half
@@ -270,7 +273,7 @@ def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> 
     for i in range(count):
         j = (i + 1) % count
         angle = (arms[j][0] - arms[i][0]) % (2 * np.pi)
-        # The kerbs of nearly opposite roads meet far away or nowhere.
+        # The kerbs of nearly opposite roads meet far away or nowhere, so such roads are left out.
         if angle > 0.9 * np.pi or count == 1:
             continue
         w1 = arms[i][1]  # left side of road i
@@ -284,7 +287,7 @@ def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> 
 def make_roads(
     nodes: list[Node], chains: list[Chain], seed: int, name: str
 ) -> tuple[list[Road], list[list[tuple[int, bool, float]]]]:
-    """Cut the streets back to the mouths of their junctions.
+    """Make the roads, which are the streets without the parts inside junctions.
 
     Args:
         nodes: Nodes of the town.

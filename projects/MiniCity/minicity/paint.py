@@ -1,4 +1,4 @@
-"""Surfaces, kerbs and paint of a town, laid out for the renderer."""
+"""Layout of the surfaces, kerbs and paint of a town, as input of the renderer."""
 
 from itertools import pairwise
 
@@ -83,7 +83,8 @@ def _add_road(scene: SceneMap, road: Road) -> None:
 def divider_pieces(road: Road) -> list[tuple[float, float]]:
     """Arc lengths (start, end) of the pieces of divider paint, in metres.
 
-    Crossings within the painted part of the road interrupt the paint, with 0.4 m to spare.
+    Crossings within the painted part of the road interrupt the paint, from 0.4 m before to 0.4 m
+    after the crossing.
     """
     pieces = []
     start = road.clear_start_m
@@ -96,7 +97,7 @@ def divider_pieces(road: Road) -> list[tuple[float, float]]:
 
 
 def lane_divider_offsets(road: Road) -> list[float]:
-    """Offsets in metres of lines between lanes of one direction, not of its first and last edge."""
+    """Offsets in metres of the lines between lanes of equal direction, without the outer edges."""
     return [*road.forward_edges[1:-1], *road.backward_edges[1:-1]]
 
 

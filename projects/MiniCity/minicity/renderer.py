@@ -27,7 +27,7 @@ SHADOW_FAR_M = 45.0  # largest distance of vehicles with a shadow
 LIGHT_UNDER_VEHICLES = 0.62  # share of the light that remains under a vehicle if no sun shines
 LIGHT_IN_SHADOW = 0.52  # share that remains under a vehicle and in its shadow if the sun shines
 LOWEST_SUN = 0.2  # sine of the elevation below which shadows do not become longer
-TOP_LIGHT = 0.1  # share of the ambient light that depends on the upward part of the normal
+TOP_LIGHT = 0.1  # share of the ambient light that depends on how far a face is turned upwards
 GLOW = 1.3  # brightness of lamps and lit windows under any light
 PAINTED_MARGIN_M = 50.0  # extent of the painted ground around a camera
 FINE_RESOLUTION_M = 0.06  # edge of a ground pixel for images of REFERENCE_WIDTH_PX
@@ -205,9 +205,9 @@ class _Drawable:
     """Polygon or disc in image coordinates.
 
     Attributes:
-        order: Sort key of four numbers; the smallest is drawn first. They are 0 for buildings and 1
-            for other objects; the negative distance of the object; the layer inside the object; and
-            the negative depth of the shape.
+        order: Sort key; the shape with the smallest key is drawn first. Its four numbers are 0 for
+            buildings or 1 for other objects, the negative distance of the object in metres, the
+            layer inside the object, and the negative depth of the shape in metres.
         group: Index of the object.
         polygon: Corners in fixed-point pixels, or None. (n, 2)
         disc: x, y and radius in fixed-point pixels, or None.
@@ -281,7 +281,7 @@ def _visible_quads(
         return
     corners = camera.to_camera(mesh.quads[index])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
-    # Camera coordinates start at the camera, so `corners` are directions of sight.
+    # The camera is the origin of camera coordinates, so `corners` are directions of sight.
     facing = np.einsum("ij,ij->i", normals, corners[:, 0]) < 0  # normals point to the camera
     in_front = (corners[..., 2] > NEAR_M).any(axis=1)
     candidates = facing & in_front
@@ -334,7 +334,7 @@ def _shade_faces(
     Args:
         colors: Colours in full light, BGR. (F, 3)
         normals_cam: Outward normals in the camera frame, of any length. (F, 3)
-        glow: Whether each face shines without light on it. (F,)
+        glow: Whether each face emits light. (F,)
         camera: The camera.
         lighting: Light on the faces.
 
@@ -428,8 +428,9 @@ def occlusion_mask(
     end = mesh.quads[walls, 1, :2]
     wall = end - start
     sight = mesh.anchors[small, :2] - eye
-    # Sight and wall cross where along_sight * sight = gap + along_wall * wall. The cross product of
-    # both sides with the wall gives `along_sight`, with the sight it gives `along_wall`.
+    # A line of sight and a wall cross where along_sight * sight = gap + along_wall * wall. The
+    # cross product of both sides with `wall` gives `along_sight`. The cross product of both sides
+    # with `sight` gives `along_wall`.
     cross = sight[:, None, 0] * wall[None, :, 1] - sight[:, None, 1] * wall[None, :, 0]
     cross = np.where(np.abs(cross) < 1e-9, 1e-9, cross)
     gap = start - eye

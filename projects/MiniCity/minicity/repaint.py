@@ -1,4 +1,4 @@
-"""Repainted streets of a town: crossings removed or added, dividers moved."""
+"""Repainting of streets of a town: crossings are removed or added, or dividers are moved."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,8 +16,8 @@ ADDED = "added"
 MOVED = "moved"
 MOVE_M = 1.0
 CROSSING_DEPTH_M = 3.2
-CROSSING_CLEARANCE_M = 4.0  # between an added crossing and the next crossing or stop line
-SHORTEST_PIECE_M = 0.1  # shorter pieces of a divider, cut off by a crossing, are ignored
+CROSSING_CLEARANCE_M = 4.0  # least gap between an added crossing and a crossing or stop line
+SHORTEST_PIECE_M = 0.1  # shorter pieces of a divider between crossings are ignored
 Spans = list[tuple[float, float]]
 
 
@@ -40,7 +40,7 @@ class Change:
     after: Array | None = None
 
     def feature(self, map_name: str) -> dict[str, Any]:
-        """Feature of the change for a GeoJSON file. A moved element has its new position.
+        """Create the GeoJSON feature of the change. A moved element has its new position.
 
         Args:
             map_name: Name of the town, in whose global frame the coordinates are.
@@ -66,7 +66,7 @@ class Change:
 
 
 def changes_geojson(changes_by_map: dict[str, list[Change]]) -> dict[str, Any]:
-    """Content of a GeoJSON file of changes, in metres of the global frames.
+    """Content of a GeoJSON file of changes, in metres in the global frames.
 
     Args:
         changes_by_map: Changes by the name of the town.
@@ -83,7 +83,7 @@ def changes_geojson(changes_by_map: dict[str, list[Change]]) -> dict[str, Any]:
 
 
 def repaint_town(town: Town, seed: int, share: float) -> tuple[Town, list[Change]]:
-    """Repaint a share of the streets of a town. The result depends on the arguments alone.
+    """Repaint a share of the streets of a town. Equal arguments give equal results.
 
     Args:
         town: The town, which is not changed.
@@ -91,8 +91,7 @@ def repaint_town(town: Town, seed: int, share: float) -> tuple[Town, list[Change
         share: Share of the streets, in [0, 1].
 
     Returns:
-        The town with the new paint and lanes, and with the surfaces and houses of the given town;
-        and every change.
+        The repainted town, in which only roads, lanes and connectors are new, and all changes.
     """
     roads = list(town.roads)
     changes: list[Change] = []
@@ -114,7 +113,7 @@ def repaint_town(town: Town, seed: int, share: float) -> tuple[Town, list[Change
 
 
 def _repaint_road(road: Road, rng: np.random.Generator) -> Road | None:
-    """Repaint a road in one of the possible ways; None if there is none."""
+    """Repaint a road in one of the possible ways, chosen at random; None if no way is possible."""
     middle_m = float(rng.uniform(low=0.35, high=0.65)) * road.length_m
     added = (middle_m - CROSSING_DEPTH_M / 2, middle_m + CROSSING_DEPTH_M / 2)
     kinds = []
@@ -139,7 +138,12 @@ def _repaint_road(road: Road, rng: np.random.Generator) -> Road | None:
 
 
 def _has_room(road: Road, added: tuple[float, float]) -> bool:
-    """Whether a crossing between two arc lengths is clear of the ends and other crossings."""
+    """Whether a new crossing keeps its clearance from the end of the paint and other crossings.
+
+    Args:
+        road: The road.
+        added: Arc lengths in metres between which the new crossing is.
+    """
     start = added[0] - CROSSING_CLEARANCE_M
     end = added[1] + CROSSING_CLEARANCE_M
     if start < road.clear_start_m or end > road.clear_end_m:

@@ -1,4 +1,4 @@
-"""Sensors of MiniCity's car: six cameras and a LiDAR, placed much as on the nuScenes car."""
+"""Sensors of MiniCity's car: six cameras and a LiDAR, in places similar to the nuScenes car."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 from minicity.camera import Camera
 from minicity.curves import Array
 
-BASE_WIDTH, BASE_HEIGHT = 1600, 900  # size of a full-size image in pixels
+# Size of a full-size image in pixels.
+BASE_WIDTH = 1600
+BASE_HEIGHT = 900
 LIDAR_POSITION = (0.94, 0.0, 1.84)  # in the ego frame (x forward, y left, z up), in metres
 # Camera axes (z forward, x right, y down) in the ego frame (x forward, y left, z up).
 _CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -116,7 +118,7 @@ def mounted_camera(mount: CameraMount, width: int, height: int, ego_pose: Array)
     """Place a camera of the car in the world.
 
     Args:
-        mount: Lens and position on the car.
+        mount: Focal length and pose of the camera on the car.
         width: Image width in pixels.
         height: Image height in pixels.
         ego_pose: Pose of the car (``world_from_ego``). (4, 4)

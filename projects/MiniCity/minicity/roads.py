@@ -10,7 +10,7 @@ from minicity.curves import Array, arc_lengths, interpolate, left_normals, tange
 CROSSING_GAP_M = 0.8  # least distance from the end of a road to a crossing
 STOP_GAP_M = 1.0  # distance from a crossing to its stop line
 STOP_LINE_M = 0.45  # width of a stop line
-_BARE_M = 0.3  # length without divider paint before a crossing without a stop line
+_BARE_M = 0.3  # length without divider paint at a crossing that has no stop line
 
 
 @dataclass(frozen=True)

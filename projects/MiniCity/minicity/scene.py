@@ -50,7 +50,7 @@ class SceneTask:
     """Description of a scene to make.
 
     Attributes:
-        name: Official scene name of nuScenes, whose split the scene is in.
+        name: Name of a scene of nuScenes. The split of this name in nuScenes is the scene's split.
         index: Number of the scene in the data set.
         location: Name of the town.
         index_in_town: Number of the street within the town, equal in all passes of the street.
@@ -71,11 +71,11 @@ class SceneTask:
 
 
 class SceneMaker:
-    """Maker of one scene.
+    """Simulator of one scene, which writes the files of the scene and collects its records.
 
     Args:
         config: Configuration of the data set.
-        task: The scene.
+        task: Description of the scene.
         town: Town of the scene.
         root: Folder of the data set.
     """
@@ -120,7 +120,7 @@ class SceneMaker:
         self.records[table].append(record)
 
     def _make_renderer(self) -> SceneRenderer:
-        """Lay out the ground and the objects around the drive."""
+        """Create the renderer of the ground and of the objects around the drive."""
         # The cameras of the first key frame are exposed before time 0.
         times = np.linspace(-0.1, self.duration_s, num=12).tolist()
         track = np.array([self.ego.pose(t)[:2] for t in times])
@@ -401,7 +401,7 @@ def _points_in_box(points: Array, vehicle: Vehicle) -> int:
 def _make_surroundings(
     town: Town, track: Array, lighting: Lighting
 ) -> tuple[FrozenMesh, list[Array]]:
-    """Buildings, trees and poles near a drive.
+    """Create the mesh and the shadows of the buildings, trees and poles near a drive.
 
     Args:
         town: The town.
@@ -433,10 +433,11 @@ def _make_surroundings(
     circle = np.column_stack([np.cos(angles), np.sin(angles)])
     for tree in town.trees[track_distance(town.trees[:, :2]) < PLANT_REACH_M]:
         add_tree(mesh, tree)
-        height = tree[2]
-        # The middle of the crown is at 0.68 of the height of a tree; its shadow is a disc with a
-        # radius of 0.26 of the height.
-        crown_shadow = tree[:2] + shadow_shift * 0.68 * height + 0.26 * height * circle
+        height = tree[2]  # a tree is (x, y, height) in metres
+        # The middle of the crown is at 0.68 of the height of a tree. The shadow of the crown is a
+        # disc with a radius of 0.26 of the height.
+        shadow_center = tree[:2] + shadow_shift * 0.68 * height
+        crown_shadow = shadow_center + 0.26 * height * circle
         shadows.append(crown_shadow)
     for pole in town.poles[track_distance(town.poles[:, :2]) < PLANT_REACH_M]:
         add_pole(mesh, pole)

@@ -68,7 +68,7 @@ class HeightGrid:
     height_m: Array
 
     def __post_init__(self) -> None:
-        """Reject holes, which would be rendered as cliffs."""
+        """Reject cells that are not finite, which would be rendered as cliffs."""
         if self.height_m.ndim != 2 or not np.isfinite(self.height_m).all():
             raise InputError(
                 f"height_m must be a finite (rows, columns) array, got shape "

@@ -1,7 +1,7 @@
 """Intersections of a camera's rays with uneven ground.
 
-A ray of a pixel is followed over the ground in a vertical plane. The ground is sampled at fixed
-distances from the camera (``RINGS``), for a part of the image columns.
+The ray of a pixel is followed over the ground in a vertical plane. The height of the ground is
+sampled at ``RINGS`` fixed distances from the camera, for a part of the image columns.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _ROW = 1024  # number of points that `sample_height` puts into a row
 
 
 def sample_height(grid: HeightGrid, points: Array) -> Array:
-    """Sample the ground height, linear between cells.
+    """Sample the ground height with linear interpolation between cells.
 
     Args:
         grid: Height of the ground.
@@ -34,7 +34,7 @@ def sample_height(grid: HeightGrid, points: Array) -> Array:
     """
     cells = ((points - grid.origin) / grid.cell_m).reshape(-1, 2).astype(np.float32)
     count = len(cells)
-    # cv2.remap takes no side longer than 32767, so the list is folded into rows.
+    # cv2.remap accepts no side longer than 32767, so the list of points is folded into rows.
     rows = -(-count // _ROW)  # rounded up
     folded = np.zeros((rows, _ROW, 2), dtype=np.float32)
     folded.reshape(-1, 2)[:count] = cells
@@ -45,7 +45,8 @@ def sample_height(grid: HeightGrid, points: Array) -> Array:
         interpolation=cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return np.asarray(heights, dtype=np.float64).reshape(-1)[:count].reshape(points.shape[:-1])
+    flat = np.asarray(heights, dtype=np.float64).reshape(-1)[:count]  # without the padding
+    return flat.reshape(points.shape[:-1])
 
 
 @dataclass(frozen=True)
@@ -69,11 +70,11 @@ class Terrain:
     skyline_rows: Array
 
     def horizon(self) -> Array:
-        """Image row of the skyline of the ground in every image column. (W,)"""
+        """Return the image row of the skyline of the ground in every image column. (W,)"""
         return np.interp(np.arange(self.camera.width), self.columns, self.skyline_rows[-1])
 
     def distances(self, rows: Array) -> Array:
-        """Horizontal distance to the ground along the rays of ``columns``.
+        """Compute the horizontal distance to the ground along the rays of ``columns``.
 
         Args:
             rows: Image rows in pixels. (h,)
@@ -82,25 +83,26 @@ class Terrain:
             Distances in metres; about ``FARTHEST_M`` for rays above the skyline. (h, c)
         """
         reach = np.empty((len(rows), len(self.columns)))
-        # Rows descend with the distance. np.interp needs ascending ones, hence both are reversed.
+        # Rows decrease with the distance. np.interp needs increasing rows, so both are reversed.
         for i, profile in enumerate(self.skyline_rows.T):
             reach[:, i] = np.interp(rows, profile[::-1], self.distances_m[::-1])
         direction, rise = self._rays(rows)  # rise per metre, < 0 if the ray descends
         eye = self.camera.center
         # Newton's method for the distance at which the ray is 0 m above the ground.
         for _ in range(NEWTON_STEPS):
-            step = 0.02 * reach + 0.02  # of the finite difference that gives the derivative
+            step = 0.02 * reach + 0.02  # step of the finite difference for the derivative
             here = sample_height(self.grid, eye[:2] + reach[..., None] * direction)
             ahead = sample_height(self.grid, eye[:2] + (reach + step)[..., None] * direction)
             above = eye[2] + reach * rise - here  # height of the ray above the ground
             closing = rise - (ahead - here) / step  # derivative of `above` by the distance
-            # `closing` is kept away from 0, and a step changes the distance by at most a tenth.
+            # `closing` is kept away from 0, and the distance changes by at most a tenth.
             move = -above / np.where(np.abs(closing) < 1e-3, -1e-3, closing)
-            reach = np.clip(reach + np.clip(move, -0.1 * reach, 0.1 * reach), 0.1, FARTHEST_M)
+            move = np.clip(move, -0.1 * reach, 0.1 * reach)
+            reach = np.clip(reach + move, 0.1, FARTHEST_M)
         return reach
 
     def points(self, rows: Array) -> Array:
-        """World x, y at which the rays of some image rows meet the ground.
+        """Compute the points (world x, y) at which the rays of image rows meet the ground.
 
         Args:
             rows: Image rows in pixels. (h,)
@@ -112,19 +114,18 @@ class Terrain:
         hits = self.camera.center[:2] + self.distances(rows)[..., None] * direction  # (h, c, 2)
         # Interpolate from `columns` to all image columns, each between `left` and `left + 1`.
         image_columns = np.arange(self.camera.width)
-        left = np.clip(
-            np.searchsorted(self.columns, image_columns, side="right") - 1, 0, len(self.columns) - 2
-        )
+        right = np.searchsorted(self.columns, image_columns, side="right")
+        left = np.clip(right - 1, 0, len(self.columns) - 2)
         span = self.columns[left + 1] - self.columns[left]
         share = ((image_columns - self.columns[left]) / span)[None, :, None]
         return hits[:, left] * (1 - share) + hits[:, left + 1] * share
 
     def _rays(self, rows: Array) -> tuple[Array, Array]:
-        """Directions of the rays of ``columns`` at image rows (h,).
+        """Compute the directions of the rays of ``columns`` at image rows (h,).
 
         Returns:
-            Horizontal unit directions (h, c, 2), and the rise per horizontal metre (h, c), which is
-            negative if the ray descends.
+            Horizontal unit directions, (h, c, 2), and the rise per horizontal metre, (h, c), which
+            is negative if the ray descends.
         """
         u, v = np.meshgrid(self.columns, rows)
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ self.camera.world_from_pixel.T
@@ -162,8 +163,8 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
     in_front = points_cam[..., 2] > NEAR_M
     # Points behind the camera are replaced by a point in front of it, whose row is not used.
     rows = camera.to_pixels(np.where(in_front[..., None], points_cam, [0.0, 0.0, 1.0]))[..., 1]
-    # Ground that is behind the camera or far below the image gets rows below the image. They
-    # decrease with the distance, as `Terrain.distances` interpolates between them.
+    # Ground that is behind the camera or far below the image gets rows below the image. These rows
+    # decrease with the distance, because `Terrain.distances` interpolates between them.
     below_image = 10.0 * camera.height + 10.0 * np.geomspace(1.0, 0.1, num=RINGS)[:, None]
     rows = np.where(in_front, np.minimum(rows, below_image), below_image)
     return Terrain(
@@ -193,7 +194,7 @@ class Footprints:
 
 
 def terrain_footprints(terrain: Terrain) -> Footprints:
-    """Footprints of the image rows on uneven ground, as medians over the columns."""
+    """Compute the footprints of the image rows on uneven ground, as medians over the columns."""
     camera = terrain.camera
     edges = terrain.distances(np.arange(camera.height + 1) - 0.5)  # upper edges of rows (H + 1, c)
     distance = np.median(edges[:-1], axis=1)

@@ -21,7 +21,7 @@ Image = MatLike
 
 @dataclass(frozen=True)
 class GroundTexture:
-    """Top views of the ground. Row 0 has the smallest y; the value of a pixel is at its centre.
+    """Top views of the ground. Row 0 has the smallest y. Pixels are sampled at their centres.
 
     Attributes:
         origin: World x, y of the corner of pixel (0, 0), in metres. (2,)
@@ -54,7 +54,10 @@ class GroundTexture:
 
 @lru_cache(maxsize=1)
 def _noise_tiles() -> tuple[Image, Image]:
-    """Periodic noise, equal in every process: blotches and grain. Each (TILE_PX, TILE_PX)"""
+    """Create tiles of periodic noise, equal in every process: blotches (large) and grain (fine).
+
+    (TILE_PX, TILE_PX) each
+    """
     rng = np.random.default_rng(20)
     blotches = np.zeros((TILE_PX, TILE_PX), dtype=np.float32)
     for cells, weight in ((16, 1.0), (64, 0.8), (256, 0.6), (512, 0.5)):
@@ -74,15 +77,15 @@ def _noise_tiles() -> tuple[Image, Image]:
 
 
 def _tile_noise(tile: Image, shape: tuple[int, int], start: list[int]) -> Image:
-    """Repeat a periodic tile to (rows, columns) pixels, from an offset (row, column). (H, W)"""
+    """Repeat a periodic tile, shifted by (rows, columns), up to the size (rows, columns). (H, W)"""
     shifted = np.roll(tile, (start[0], start[1]), axis=(0, 1))
     repeats = [-(-n // TILE_PX) for n in shape]  # rounded up
     return np.tile(shifted, repeats)[: shape[0], : shape[1]]
 
 
 def _fixed_point_pixels(points: Array, origin: Array, resolution_m: float) -> NDArray[np.int32]:
-    """Pixels of world points in OpenCV's fixed-point format. (n, 2) or (n, 3) -> (n, 2)"""
-    # In OpenCV's coordinates the centre of a pixel, not its corner, is at a whole number.
+    """Convert world points to pixels in OpenCV's fixed-point format. (n, 2 or 3) -> (n, 2)"""
+    # In OpenCV's coordinates, the centre of a pixel, not its corner, is at a whole number.
     px = (np.asarray(points)[:, :2] - origin) / resolution_m - 0.5
     return np.round(px * (1 << SHIFT)).astype(np.int32)
 
@@ -145,7 +148,7 @@ def paint_ground(
 
 
 def _halve_repeatedly(color: Image) -> list[Image]:
-    """Image (H, W, 3) at ``LEVELS`` resolutions, each half of the previous one."""
+    """Resize an image (H, W, 3) to ``LEVELS`` resolutions, each half of the previous one."""
     levels: list[Image] = [color]
     for _ in range(LEVELS - 1):
         rows, columns = levels[-1].shape[:2]
@@ -185,7 +188,7 @@ def _paint_kerbs(color: Image, scene: SceneMap, origin: Array, resolution_m: flo
 def _paint_coat(
     outlines: list[Array], wear: float, blotches: Image, origin: Array, resolution_m: float
 ) -> tuple[tuple[slice, slice], Image] | None:
-    """Opacity of paint that is worn off in blotches.
+    """Compute the opacity of paint that is worn off in blotches.
 
     Args:
         outlines: Painted areas in the world, in metres. Each (n, 2)
@@ -195,17 +198,18 @@ def _paint_coat(
         resolution_m: Edge of a pixel in metres.
 
     Returns:
-        Window (rows, columns) of the texture and the opacity inside it in [0, 255] (h, w), or None
-        where no paint lies on the texture.
+        Window (rows, columns) of the texture, and the opacity in the window in [0, 255], (h, w).
+        None if no paint lies on the texture.
     """
     if not outlines:
         return None
     # OpenCV rounds edges along the axes to whole pixels, so the paint is drawn at twice the
     # resolution and averaged.
     px = [_fixed_point_pixels(outline, origin, resolution_m / 2) for outline in outlines]
-    # Whole pixels of the texture: SHIFT bits are the fraction, and one bit the doubled resolution.
+    # Whole pixels of the texture. The shift removes SHIFT bits of the fraction, and one bit of the
+    # doubled resolution.
     all_px = np.concatenate(px) >> (SHIFT + 1)
-    # The window has a margin of two pixels, for smoothed edges; `high` is exclusive.
+    # The window has a margin of two pixels for smoothed edges. `high` is exclusive.
     low = np.maximum(all_px.min(axis=0) - 2, 0)
     high = np.minimum(all_px.max(axis=0) + 3, blotches.shape[::-1])  # columns, rows
     if (high <= low).any():
@@ -233,7 +237,7 @@ def _blend(target: Image, paint: tuple[int, int, int], alpha: Image) -> None:
     rows, columns = np.nonzero(alpha)
     opacity = alpha[rows, columns, None].astype(np.float32) / 255
     under = target[rows, columns].astype(np.float32)
-    # The grain of the surface modulates the paint. Grey level 90 leaves its colour unchanged.
+    # The brightness of the surface modulates the paint. Brightness 90 leaves its colour unchanged.
     brightness = np.clip(under.mean(axis=1, keepdims=True) / 90, 0.5, 1.4)
     coat = np.asarray(paint, dtype=np.float32) * (0.86 + 0.14 * brightness)
     target[rows, columns] = np.clip(under + opacity * (coat - under), 0, 255).astype(np.uint8)
@@ -248,7 +252,7 @@ def darken(texture: GroundTexture, outlines: list[Array], strength: float) -> Gr
         strength: Share of the light that is lost in a shadow, in [0, 1].
 
     Returns:
-        A texture with shadows and with the reflectivity of ``texture``.
+        A texture with shadows. Its reflectivity is not changed.
     """
     if not outlines or strength <= 0:
         return texture

@@ -14,9 +14,9 @@ from minicity.network import MARGIN_M, MIN_ROAD_M, PITCH_M, make_chains, make_no
 from minicity.roads import CROSSING_GAP_M, STOP_LINE_M, Lane, Road
 
 LaneKey = tuple[int, bool, int]
-"""Identity of a lane within its town: road, direction and index."""
+"""Key of a lane within its town: index of the road, direction, and index of the lane."""
 MAX_SIDE = 8  # largest number of grid nodes along an edge of a town
-LARGEST_HOUSE_M = 22.0  # houses whose centres are farther apart, in x or y, cannot touch
+LARGEST_HOUSE_M = 22.0  # houses cannot touch if their centres are farther apart in x or y
 END_STOP_M = 0.6  # distance of a stop line without a crossing from the end of its road
 BAY_WIDTH_M = 2.6
 BAY_LENGTH_M = 5.0
@@ -66,7 +66,7 @@ class Building:
 
 @dataclass
 class Town:
-    """Town, complete for a map file and for the renderer. Coordinates are in metres.
+    """Town with all data for a map file and for the renderer. Coordinates are in metres.
 
     Attributes:
         name: Location name.
@@ -98,7 +98,7 @@ class Town:
 
 
 def town_side(num_scenes: int) -> int:
-    """Number of grid nodes along the edge of a town in which scenes rarely share a street."""
+    """Number of grid nodes along the edge of a town, for scenes that rarely share a street."""
     return int(np.clip(np.ceil(np.sqrt(1.3 * num_scenes)), 3, MAX_SIDE))
 
 
@@ -149,7 +149,7 @@ def connect_lanes(
         junctions: Junctions of the roads.
 
     Returns:
-        Lanes by key, and the paths from a lane across a junction by the key of the lane.
+        Lanes by key, and paths across junctions by the key of the lane from which they start.
     """
     lanes_by_road = {road.index: road.lanes() for road in roads}
     connectors: dict[LaneKey, list[Connector]] = {}
@@ -176,7 +176,7 @@ def _add_crossings(road: Road, rng: np.random.Generator) -> None:
             depth_m = float(rng.uniform(low=2.5, high=4.5))
             stop = lanes_in > 0 and rng.random() < 0.8
             road.add_crossing(gap_m, depth_m, at_start=at_start, stop=stop)
-        elif lanes_in and rng.random() < 0.6:  # a stop line alone, at which divider paint ends
+        elif lanes_in and rng.random() < 0.6:  # only a stop line, at which painted dividers end
             if at_start:
                 road.stop_backward = (END_STOP_M, END_STOP_M + STOP_LINE_M)
                 road.clear_start_m = END_STOP_M + STOP_LINE_M
@@ -312,7 +312,7 @@ def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> No
                 arc_m += front + float(gap)
                 outline = Polygon(house.footprint)
                 center = house.footprint.mean(axis=0)
-                # Houses are near if both their distances, in x and in y, are small.
+                # Only houses with small distances in both x and y can touch this one.
                 distances = np.abs(centers - center).max(axis=1, initial=0.0)
                 neighbours = np.flatnonzero(distances < LARGEST_HOUSE_M)
                 if blocked.intersects(outline) or _touches_building(town, outline, neighbours):

@@ -32,19 +32,19 @@ PAINTS: list[Color] = [
     (70, 150, 200),
 ]
 REACH_M = 75.0  # largest distance of traffic from the drive of the ego vehicle
-_LONGEST_SCENE_S = 20  # the paths of other vehicles suffice for this time
+_LONGEST_SCENE_S = 20  # the paths of other vehicles are long enough for this time
 SWING_M = 6.0  # distance in which the phase of a swing grows by 1 radian
-PASS_START_M = 3.0  # largest shift of the start of another drive along a path, to either side
+PASS_START_M = 3.0  # the start of another pass is shifted by at most this, forward or backward
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Drive along a path at constant speed, with a gentle swing around the lane's centre.
+    """Drive along a path at constant speed, swinging gently around the lane's centre.
 
     Attributes:
-        path: Lane centres one after another, in metres. (n, 2)
+        path: Centre lines of successive lanes, concatenated, in metres. (n, 2)
         speed: Speed along the path in m/s.
-        start_m: Arc length at time 0, in metres.
+        start_m: Arc length along the path at time 0, in metres.
         swing_m: Amplitude of the swing in metres.
         swing_rad: Phase of the swing in radians.
         shift_m: Constant offset to the left in metres.
@@ -69,7 +69,8 @@ class Drive:
         lengths: list[float] = self._lengths  # type: ignore[attr-defined]
         rows: list[list[float]] = self._rows  # type: ignore[attr-defined]
         arc_m = min(max(self.start_m + self.speed * time_s, 0.0), lengths[-1])
-        # The position lies between the points i and i + 1 of the path.
+        # The position is between the points i and i + 1 of the path. Interpolate both position and
+        # tangent.
         i = min(max(bisect_right(lengths, arc_m) - 1, 0), len(lengths) - 2)
         share = (arc_m - lengths[i]) / (lengths[i + 1] - lengths[i])
         x, y, dx, dy = [a + share * (b - a) for a, b in zip(rows[i], rows[i + 1], strict=True)]
@@ -83,17 +84,17 @@ class Drive:
 
 
 def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Generator) -> Array:
-    """Follow lanes from the beginning of a lane, with random turns at junctions.
+    """Create a path along lanes from the beginning of a lane, with random turns at junctions.
 
     Args:
         town: The town.
         first: First lane.
-        length_m: Least length of the path in metres. The path is shorter if its lanes have no
+        length_m: Smallest length of the path in metres. The path is shorter if its last lane has no
             successor.
-        rng: Source of the turns.
+        rng: Random generator that chooses the turns.
 
     Returns:
-        Path of equally spaced points in metres. (n, 2)
+        Path of equally spaced points, in metres. (n, 2)
     """
     lane = first
     pieces = [first.center]
@@ -116,10 +117,10 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
         town: The town.
         scene: Number of the scene in its town.
         duration_s: Duration of the scene in seconds.
-        rng: Source of lane, speed and start.
+        rng: Random generator that chooses lane, speed, start and swing.
 
     Returns:
-        A drive that lasts for the scene.
+        A drive whose path is long enough for the scene.
 
     Raises:
         RuntimeError: If the town has no path of sufficient length.
@@ -132,9 +133,9 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
         lanes = road.lanes()
         lane = lanes[int(rng.integers(len(lanes)))]
         speed = float(rng.uniform(low=5.0, high=13.0))
-        length = speed * duration_s + 8.0  # with a path of 8 m after the drive
+        length = speed * duration_s + 8.0  # the path goes on for 8 m after the drive
         lane_m = float(arc_lengths(lane.center)[-1])
-        latest = max(lane_m - 6.0, 0.0)
+        latest = max(lane_m - 6.0, 0.0)  # 6 m before the end of the lane
         # With probability 0.6, the drive ends near the junction at the end of the lane or beyond
         # it. Otherwise it starts anywhere on the lane.
         earliest = max(0.0, latest - length - 10.0) if rng.random() < 0.6 else 0.0
@@ -155,14 +156,14 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
 
 
 def vary_drive(drive: Drive, rng: np.random.Generator) -> Drive:
-    """Vary a drive for another pass of its path: start, speed and place within the lane.
+    """Vary start, speed and position in the lane of a drive, for another pass along its path.
 
     Args:
         drive: Drive of `plan_ego`.
-        rng: Source of the differences.
+        rng: Random generator of the differences.
 
     Returns:
-        A drive along the path of ``drive`` that also lasts for the scene.
+        A drive along the path of ``drive``, which is also long enough for the scene.
     """
     # The path of `plan_ego` ends at least 4 m after the drive.
     start = drive.start_m + float(rng.uniform(low=-PASS_START_M, high=PASS_START_M))
@@ -181,8 +182,8 @@ class Actor:
     """Vehicle or person of a scene.
 
     Attributes:
-        model: Kind, size and paint; position and heading count only where ``drive`` is None.
-        drive: Motion, None for vehicles and people at rest.
+        model: Kind, size and paint. Its position and heading are used only if ``drive`` is None.
+        drive: Motion; None for vehicles and people at rest.
     """
 
     model: Vehicle
@@ -206,7 +207,7 @@ class Actor:
 
 
 def _random_vehicle(rng: np.random.Generator, identity: str, only_cars: bool = False) -> Vehicle:
-    """Draw kind, size and paint of a vehicle at the origin."""
+    """Create a vehicle of random kind, size and paint at the origin."""
     kind = CAR_KIND
     if not only_cars:
         kind = int(rng.choice(len(KINDS), p=[share for _, _, share in KINDS]))
@@ -232,12 +233,12 @@ def make_actors(town: Town, ego: Drive, duration_s: float, rng: np.random.Genera
         town: The town.
         ego: The ego vehicle's drive.
         duration_s: Duration of the scene in seconds.
-        rng: Source of all random choices.
+        rng: Random generator of all choices.
 
     Returns:
         Moving vehicles, parked vehicles and people.
     """
-    times = np.linspace(0.0, duration_s, num=8).tolist()
+    times = np.linspace(0.0, duration_s, num=8).tolist()  # times at which gaps are checked
     ego_track = np.array([ego.pose(t)[:2] for t in times])
     density = float(rng.uniform(low=0.25, high=1.0))
     candidates = [
@@ -260,15 +261,15 @@ def make_actors(town: Town, ego: Drive, duration_s: float, rng: np.random.Genera
 
 
 def _least_distance(track: Array, other: Array) -> float:
-    """Least distance in metres between two tracks (T, 2) of equal times."""
+    """Smallest distance in metres between the positions of two tracks (T, 2) at equal times."""
     return np.linalg.norm(track - other, axis=1).min()
 
 
 def _least_gaps(actor: Actor) -> tuple[float, float]:
-    """Least distance in metres from an actor to the ego vehicle, and to the other actors."""
+    """Smallest allowed distances in metres from an actor to the ego vehicle and to other actors."""
     if actor.model.category.startswith("human"):
         return 2.5, 0.7
-    half = actor.model.size[0] / 2
+    half = actor.model.size[0] / 2  # half the length of the vehicle
     # A parked vehicle may stand beside the ego vehicle; a moving one may approach it lengthwise.
     ego_gap = 2.8 + 0.35 * half if actor.drive is None else 3.6 + half
     return ego_gap, 1.2 + 0.6 * half
@@ -289,15 +290,16 @@ def _moving_vehicles(
         town: The town.
         track: Positions of the ego vehicle in metres. (T, 2)
         density: Number of vehicles relative to dense traffic, in (0, 1].
-        rng: Source of all random choices.
+        rng: Random generator of all choices.
     """
     actors: list[Actor] = []
     for lane in town.lanes.values():
-        if not _is_near(lane.center[::6], track):
+        if not _is_near(lane.center[::6], track):  # every sixth point is enough
             continue
         arc_m = float(rng.uniform(low=0, high=40))
         lane_m = float(arc_lengths(lane.center)[-1])
-        # All vehicles of a lane stand, or they drive at one speed and so keep their distances.
+        # All vehicles of a lane are at rest, or they all drive at one speed, which keeps their
+        # distances constant.
         driving_speed = rng.uniform(low=4, high=12)
         speed = float(rng.choice([0.0, driving_speed], p=[0.25, 0.75]))
         while arc_m < lane_m:
@@ -323,7 +325,7 @@ def _parked_vehicles(
         town: The town.
         track: Positions of the ego vehicle in metres. (T, 2)
         density: Traffic relative to dense traffic, in (0, 1].
-        rng: Source of all random choices.
+        rng: Random generator of all choices.
     """
     actors = _cars_on_shoulders(town, track, density=density, rng=rng)
     for park in town.carparks:
@@ -344,9 +346,9 @@ def _cars_on_shoulders(
     Args:
         town: The town.
         track: Positions of the ego vehicle in metres. (T, 2)
-        density: Traffic relative to dense traffic, in (0, 1]. In denser traffic, more places are in
-            use.
-        rng: Source of all random choices.
+        density: Traffic relative to dense traffic, in (0, 1]. In denser traffic, more parking
+            places are in use.
+        rng: Random generator of all choices.
     """
     actors: list[Actor] = []
     for road in town.roads:
@@ -367,7 +369,7 @@ def _cars_on_shoulders(
                     car = _random_vehicle(rng, f"p{len(actors)}", only_cars=True)
                     yaw = road.direction(arc_m) + turn
                     actors.append(_actor_at_rest(car, road.point(arc_m, offset), yaw=yaw))
-                arc_m += 6.2  # length of a place
+                arc_m += 6.2  # length of a parking place
     return actors
 
 
@@ -393,7 +395,7 @@ def _people(town: Town, track: Array, rng: np.random.Generator) -> list[Actor]:
 
 
 def _people_spots(road: Road, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Arc lengths and offsets of people beside a road and on its crossings, in metres."""
+    """Random arc lengths and offsets of people beside a road and on its crossings, in metres."""
     section = road.section
     spots = []
     for _ in range(int(road.length_m / 18)):

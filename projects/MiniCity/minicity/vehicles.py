@@ -27,8 +27,8 @@ class Vehicle:
     """Vehicle or person at one moment.
 
     Attributes:
-        category: nuScenes category. ``human.*`` is drawn as a person, ``vehicle.car`` as a car with
-            a cabin, any other as a tall box with windows.
+        category: Category of nuScenes. ``human.*`` is drawn as a person, ``vehicle.car`` as a car
+            with a cabin, and every other category as a tall box with windows.
         center: x, y, z of the box's centre in the world, in metres. (3,)
         yaw_rad: Heading in radians, anticlockwise from +x.
         size: Length, width, height in metres.
@@ -111,7 +111,7 @@ def _add_person(mesh: Mesh, size: Size, color: Color) -> None:
 
 @lru_cache(maxsize=4096)
 def _template(category: str, size: Size, color: Color) -> FrozenMesh:
-    """Mesh of a vehicle or person at the origin, on z = 0 and heading along +x."""
+    """Mesh of a vehicle or person that stands at the origin, on z = 0, and heads along +x."""
     mesh = Mesh()
     mesh.begin(anchor=np.array([0.0, 0.0, size[2] / 2]))
     if category.startswith("human"):

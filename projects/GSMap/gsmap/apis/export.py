@@ -1,4 +1,4 @@
-"""Export of a trained model to a single ONNX file, from images and calibration to elements."""
+"""Export of a trained model to one ONNX file that computes elements from images and calibration."""
 
 import json
 import tempfile
@@ -33,18 +33,19 @@ OPSET = 18
 
 
 class ExportedDetector(nn.Module):
-    """A camera `MapDetector` as a function of tensors, for one sample.
+    """Module that runs a camera `MapDetector` on the tensors of one sample.
 
-    For a model with memory, it computes one step of a stream. Then the memory of the previous frame
-    is part of the inputs, and the new memory is part of the outputs.
+    A model with memory runs one step of a stream: the memory of the previous frame is part of the
+    inputs, and the new memory is part of the outputs.
 
     Args:
         model: A `MapDetector` of cameras.
 
     Attributes:
-        input_names: Names of the inputs. Names of the memory are added by `example_inputs`.
-        output_names: Names of the outputs. Names of the memory are added by `example_inputs`.
-        memory: Names of the tensors of the memory; empty until `example_inputs`.
+        input_names: Names of the inputs. `example_inputs` appends the names of the memory tensors.
+        output_names: Names of the outputs. `example_inputs` appends the names of the new memory
+            tensors.
+        memory: Names of the memory tensors; empty before the first call of `example_inputs`.
 
     Raises:
         ValueError: If the model reads LiDAR, or its head or its memory cannot be exported.
@@ -84,23 +85,23 @@ class ExportedDetector(nn.Module):
                 if name not in calibration:
                     calibration.append(name)
         self.input_names = ("images", *calibration, *prior_inputs, *stream_inputs)
-        # The first output of a head's references is the points.
+        # The first output of the references is always the points.
         self.output_names = ("scores", "labels", "points", *head.reference.outputs[1:])
         self.memory: tuple[str, ...] = ()
         self._empty_memory: dict[str, Tensor] = {}
 
     def forward(self, images: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Predict the best map elements, including elements outside of the map.
+        """Predict the map elements with the highest scores, even outside of the map's range.
 
         Args:
             images: Pixel values of the data pipeline: 0 to 255, neither normalised nor padded.
                 (V, 3, H, W)
             inputs: Tensors of ``input_names[1:]``. The first ones are the calibration of the BEV
-                encoder, (V, 4, 4) or (18,) each. A model with a map prior also takes the window of
-                the prior (classes, H, W). A model with memory also takes the transform from the
-                previous to the current frame in metres (4, 4), the seconds between both frames
-                (1,), 1 or 0 for whether the stream continues (1,), and the memory of the previous
-                frame.
+                encoder and the map prior: matrices (V, 4, 4), or CAN bus signals (18,). A model
+                with a map prior also takes the window of the prior (classes, H, W). A model with
+                memory also takes the transform from the previous to the current frame in metres
+                (4, 4), the seconds between both frames (1,), 1 if the stream continues or else 0
+                (1,), and the memory of the previous frame.
 
         Returns:
             Tensors of ``output_names``, best element first: scores (M,), labels (M,), and points in
@@ -119,12 +120,12 @@ class ExportedDetector(nn.Module):
 
         Args:
             images: Pixel values of the data pipeline. (V, 3, H, W)
-            inputs: Other inputs by name, without batch dimension.
+            inputs: Other inputs of `forward` by name.
 
         Returns:
             Fields of the elements in the order of ``output_names``, and the new memory by name.
         """
-        # The preprocessor normalises and pads each image of a tensor with four axes by itself.
+        # The preprocessor normalises and pads each of the V images separately.
         batch = self.model.data_preprocessor({"inputs": {"img": images}})
         images = batch["inputs"]["imgs"]
         all_levels = self.model.extract_img_feats(images[None])
@@ -171,10 +172,10 @@ class ExportedDetector(nn.Module):
 
     @torch.no_grad()
     def example_inputs(self, num_cams: int, image_size: tuple[int, int]) -> tuple[Tensor, ...]:
-        """Create inputs of the right shapes: black images of cameras at the origin.
+        """Create inputs of the right shapes, with black images of cameras at the origin.
 
-        For a model with memory, the first call computes a frame to find the names and shapes of the
-        memory.
+        For a model with memory, the first call runs the model on a frame to find the names and
+        shapes of the memory.
 
         Args:
             num_cams: Number of cameras.
@@ -221,8 +222,8 @@ def export_onnx(
 ) -> None:
     """Export a model to an ONNX file with standard operators only.
 
-    The metadata of the file contain the pose of the annotation frame on the vehicle if ``model`` is
-    from ``load_model``.
+    If ``model`` was loaded by ``load_model``, the metadata of the file contain the pose of the
+    annotation frame on the vehicle.
 
     Args:
         model: A `MapDetector` with its weights on the CPU. It is set to evaluation mode.
@@ -267,7 +268,7 @@ def export_onnx(
 def graph_metadata(
     exported: ExportedDetector, cameras: Sequence[str], image_size: tuple[int, int], frame: str
 ) -> dict[str, Any]:
-    """Metadata of an ONNX file for `OnnxInferencer`.
+    """Create the metadata of an ONNX file, which `OnnxInferencer` reads.
 
     Args:
         exported: The model in its exported form.
@@ -305,11 +306,13 @@ def graph_metadata(
 
 
 def signals_rule(model: Any) -> str:
-    """Description of the ``can_bus`` values that a model of `load_model` was trained with."""
+    """Describe the ``can_bus`` values with which a model from `load_model` was trained."""
     if getattr(model, "without_signals", False):
         return NO_SIGNALS
     cfg = getattr(model, "cfg", None)
-    loader = {} if cfg is None else cfg.get("test_dataloader") or {}
+    loader: Any = {}
+    if cfg is not None:
+        loader = cfg.get("test_dataloader") or {}
     pose_only = loader.get("dataset", {}).get("pose_only_signals", False)
     return POSE_ONLY_RULE if pose_only else CAN_BUS_RULE
 
@@ -317,7 +320,7 @@ def signals_rule(model: Any) -> str:
 def halve_onnx(path: str | Path, out: str | Path) -> None:
     """Convert the convolutions of an exported file to half precision.
 
-    Convolutions are nearly all of the arithmetic. All other operators, which compute positions and
+    Convolutions do nearly all of the arithmetic. All other operators, which compute positions and
     scores of elements, stay in float32.
 
     Args:
@@ -335,7 +338,7 @@ def halve_onnx(path: str | Path, out: str | Path) -> None:
         if node.op_type not in ("Conv", "ConvTranspose"):
             model.graph.node.append(node)
             continue
-        for name in node.input[1:]:
+        for name in node.input[1:]:  # weight and bias
             half = numpy_helper.to_array(weights[name]).astype(np.float16)
             weights[name].CopyFrom(numpy_helper.from_array(half, name=name))
         image, *parameters = node.input
@@ -344,6 +347,7 @@ def halve_onnx(path: str | Path, out: str | Path) -> None:
         half_output = f"{result}_half_out"
         node.input[:] = [half_input, *parameters]
         node.output[:] = [half_output]
+        # The convolution itself runs in float16, between two casts.
         before = helper.make_node("Cast", [image], [half_input], to=TensorProto.FLOAT16)
         after = helper.make_node("Cast", [half_output], [result], to=TensorProto.FLOAT)
         model.graph.node.extend([before, node, after])
@@ -354,7 +358,7 @@ def halve_onnx(path: str | Path, out: str | Path) -> None:
 def quantize_onnx(
     path: str | Path, out: str | Path, inputs: Iterable[dict[str, NDArray[np.float32]]]
 ) -> None:
-    """Quantize the convolutions of an exported file to 8 bits, with calibration on samples.
+    """Quantize the convolutions of an exported file to 8 bits, with value ranges from samples.
 
     Args:
         path: File of `export_onnx`.
@@ -392,10 +396,10 @@ def quantize_onnx(
 def graph_inputs(
     inferencer: OnnxInferencer, dataset: Any, indices: Iterable[int]
 ) -> Iterator[tuple[str, dict[str, NDArray[np.float32]]]]:
-    """Inputs of the exported graph for samples of a data set.
+    """Yield the inputs of the exported graph for samples of a data set.
 
-    For a model with memory, the graph is run as well, and the samples of a scene form a stream in
-    the order of ``indices``.
+    For a model with memory, the samples of a scene form a stream in the order of ``indices``, and
+    the graph is run on each sample to compute its new memory.
 
     Args:
         inferencer: The exported graph.
@@ -429,8 +433,8 @@ def largest_differences(
         found: Elements of the first prediction.
         expected: Elements of the second prediction.
         unfolded: Class indices of ``unfold_classes``, whose points are reordered to a short path.
-            Where two orders are nearly equally short, rounding determines which one is selected, so
-            the order of points does not count for these classes.
+            If two orders are nearly equally short, rounding decides between them. The order of
+            points is therefore ignored for these classes.
 
     Returns:
         The largest difference of a score, and the largest distance in metres of an element from the
@@ -459,10 +463,10 @@ def largest_differences(
 
 
 def _operator_translations() -> dict[Any, Any]:
-    """Translations of torch's operators to ONNX that replace the exporter's."""
+    """Translations of torch's operators to ONNX that replace the translations of the exporter."""
     from onnxscript import opset18
 
-    op: Any = opset18  # its annotations expect element types, which are unknown here
+    op: Any = opset18  # Any, as its type annotations expect element types that are unknown here
 
     def embedding_bag(
         table: Any,
@@ -475,29 +479,30 @@ def _operator_translations() -> dict[Any, Any]:
         include_last_offset: bool,
         _padding_idx: int | None,
     ) -> Any:
-        """Weighted sums of rows of a table, in bags of one size, without a loop over the bags.
+        """Compute weighted sums of table rows for bags of equal size, without a loop over bags.
 
-        Deformable sampling (`gsmap.ops.deformable_sampling.sum_rows`) calls the operator in this
-        way.
+        A bag is the group of rows of one sum. Deformable sampling
+        (`gsmap.ops.deformable_sampling.sum_rows`) has bags of equal size.
         """
         is_sum = mode == 0  # the other modes are the mean and the maximum
         if not is_sum or weights is None or include_last_offset:
             raise NotImplementedError("embedding_bag other than weighted sums in bags of one size")
         one = op.Constant(value_ints=[1])
         num_bags = op.Shape(offsets)
-        bag_size = op.Div(op.Shape(rows), op.Max(num_bags, one))  # Reshape to -1 fails for 0 bags
-        bags = op.Concat(num_bags, bag_size, axis=0)  # shape of rows and weights, one row per bag
+        # The size is computed, because a Reshape to -1 would fail for 0 bags.
+        bag_size = op.Div(op.Shape(rows), op.Max(num_bags, one))
+        bags = op.Concat(num_bags, bag_size, axis=0)  # the shape (bags, rows of a bag)
         weights = op.Unsqueeze(op.Reshape(weights, bags, allowzero=1), one)
         # (bags, 1, rows of a bag) @ (bags, rows of a bag, C)
         sums = op.MatMul(weights, op.Gather(table, op.Reshape(rows, bags, allowzero=1)))
-        # The operator has three more outputs, which serve its backward pass alone.
+        # The operator has three more outputs, which only its backward pass needs.
         return op.Squeeze(sums, one), offsets, offsets, offsets
 
     return {torch.ops.aten.embedding_bag.padding_idx: embedding_bag}
 
 
 def _describe_export_error(error: BaseException) -> str:
-    """Message of the error that caused all others in a failed export."""
+    """Describe the root cause of a failed export."""
     while error.__cause__ is not None:
         error = error.__cause__
     if isinstance(error, GsmapError):  # raised by the model, for example for a number of cameras

@@ -1,8 +1,8 @@
-"""Frames on a GPU as replayed CUDA graphs.
+"""Fast prediction of frames on a GPU by CUDA graphs.
 
-A frame of these models consists of hundreds of small operations, and the GPU waits for the host to
-launch each of them. If no tensor size depends on values, all launches of a frame are recorded once
-per image size, and replayed for later frames.
+The prediction of a frame consists of hundreds of small operations, and the GPU waits for the host
+to launch each of them. If no tensor size depends on the values of tensors, all launches of a frame
+can be recorded once per image size as a CUDA graph, and replayed for later frames.
 """
 
 import threading
@@ -30,13 +30,13 @@ _WARM_UP = 3  # frames before a capture, in which libraries select and load kern
 
 
 def reason_against(model: Any) -> str:
-    """Reason why a model has no static form (`StaticFrame`).
+    """Reason why a model cannot be computed with tensors of fixed sizes (`StaticFrame`).
 
     Args:
         model: A `MapDetector`.
 
     Returns:
-        The reason, as a clause about the model; empty if the model has a static form.
+        The reason, as a clause for a message; empty if there is no reason.
     """
     head = model.map_head
     if model.lidar_encoder is not None:
@@ -53,18 +53,18 @@ def reason_against(model: Any) -> str:
 
 
 class StaticFrame(nn.Module):
-    """A model from pixels to its best elements, as a function of tensors with fixed sizes.
+    """Computes the best elements of a frame from pixels, with tensors of fixed sizes only.
 
     Args:
         model: A camera `MapDetector` in evaluation mode. Its encoder is switched to operations of
             fixed sizes, whose results differ from the default operations by rounding.
 
     Attributes:
-        names: Names of the calibration arrays.
+        names: Names of the calibration arrays that the BEV encoder reads.
         layout: Shape and type of each field of an element, by name; empty before the first call.
 
     Raises:
-        ValueError: If the model has no static form (`reason_against`).
+        ValueError: If the model cannot be computed with fixed sizes (`reason_against`).
     """
 
     def __init__(self, model: Any) -> None:
@@ -109,7 +109,7 @@ class StaticFrame(nn.Module):
 
         Args:
             scores: Class logits of all elements. (N, classes)
-            references: References of all elements, as the head predicts them.
+            references: References (encoded geometry) of all elements, as the head predicts them.
 
         Returns:
             The M best elements, each as the F numbers of its fields in the order of ``layout``.
@@ -149,7 +149,7 @@ class StaticFrame(nn.Module):
 
 @dataclass
 class _Recording:
-    """Recorded frame of one size.
+    """Recorded prediction for inputs of fixed shapes and types.
 
     Attributes:
         graph: The CUDA graph.
@@ -166,14 +166,15 @@ class _Recording:
 
 @dataclass
 class FastFrames:
-    """Predictor of batches by a `StaticFrame`, recorded as a CUDA graph for each size.
+    """Predicts batches with a `StaticFrame` that is recorded as a CUDA graph for each input size.
 
-    It is safe for several threads, whose frames are computed one after another.
+    Several threads may call an instance; their batches are computed one after another.
 
     Args:
         frame: The model as a function of tensors.
         device: Device of the model.
-        capture: Whether frames are recorded and replayed; if not, their operations are launched.
+        capture: Whether frames are recorded and replayed. If False, their operations are launched
+            one by one.
     """
 
     frame: StaticFrame
@@ -242,7 +243,7 @@ class FastFrames:
             sample.set_metainfo({"batch_input_shape": shape, "pad_shape": pad_shape})
 
     def _run(self, inputs: Sequence[Tensor]) -> Tensor:
-        """Compute the elements of a batch, by the recorded frame of this size.
+        """Compute the elements of a batch by replaying the recording for its sizes.
 
         Args:
             inputs: Images and calibration arrays.
@@ -261,9 +262,8 @@ class FastFrames:
             for buffer, value in zip(recording.inputs, inputs, strict=True):
                 buffer.copy_(value, non_blocking=True)
             recording.graph.replay()
-            # While the GPU computes, the versions of the weights are compared with the versions at
-            # the recording. If a weight has changed, this result is dropped, and the loop records
-            # the frame again.
+            # While the GPU computes, compare the versions of the weights with their versions at the
+            # time of the recording. If a weight has changed, drop this result and record again.
             if tensor_versions(self.frame.model) == recording.versions:
                 self._graphs.move_to_end(key)
                 return recording.output.cpu()
@@ -273,7 +273,7 @@ class FastFrames:
         """Record a frame with the sizes of the inputs.
 
         Args:
-            key: Key of the sizes and types.
+            key: Shapes and types of the inputs, the key of the recording.
             inputs: Images and calibration arrays.
         """
         while len(self._graphs) >= _MOST_GRAPHS:
@@ -302,7 +302,7 @@ class FastFrames:
         return self._graphs[key]
 
     def _with_predictions(self, sample: "Det3DDataSample", elements: Tensor) -> "Det3DDataSample":
-        """Add the elements on the map to a sample.
+        """Add the elements inside of the map range to a sample, as its predictions.
 
         Args:
             sample: The sample.

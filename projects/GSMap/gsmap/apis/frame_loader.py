@@ -1,4 +1,4 @@
-"""Frames for inference. Absent cameras get blank images, and broken frames are set apart."""
+"""Loading of frames for inference. Absent cameras get blank images; broken frames are listed."""
 
 import copy
 import errno
@@ -17,7 +17,7 @@ from gsmap.utils.errors import InputError
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
-# Too many open files of the process or of the system, and too little memory.
+# Error numbers of too many open files in the process or the system, and of too little memory.
 _LACK_OF_RESOURCES = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
 
 
@@ -36,13 +36,13 @@ class BrokenFrame:
 
 @dataclass(eq=False)
 class FrameDataset(Dataset):
-    """Frames of a test data set; errors of a frame become a `BrokenFrame`.
+    """Frames of a test data set. A frame that cannot be loaded becomes a `BrokenFrame`.
 
     Args:
         dataset: The data set. Its ``cameras`` are the names of the cameras that the model expects;
             without names, frames are loaded as they are.
-        blank_cameras: Whether absent cameras of a frame get black images, as long as the frame has
-            another camera. Otherwise such a frame is broken.
+        blank_cameras: Whether absent cameras of a frame get black images, if at least one camera is
+            present. Otherwise a frame with absent cameras is broken.
     """
 
     dataset: "VectorizedMapDataset"
@@ -66,7 +66,8 @@ class FrameDataset(Dataset):
             row: Index of the sample.
 
         Raises:
-            ValueError: If cameras are absent and ``blank_cameras`` does not allow it.
+            ValueError: If cameras are absent and ``blank_cameras`` is False, or if all cameras are
+                absent.
         """
         cameras = self.dataset.cameras
         sample = self.dataset.sample(row)
@@ -92,7 +93,7 @@ def collate(items: Sequence[dict[str, Any] | BrokenFrame]) -> tuple[Any, list[Br
         items: Frames of a `FrameDataset`.
 
     Returns:
-        The batch of the usable frames, or None if there is none, and the broken frames.
+        The batch of the usable frames, which is None without usable frames, and the broken frames.
     """
     broken: list[BrokenFrame] = []
     usable: list[dict[str, Any]] = []
@@ -121,7 +122,8 @@ def _add_blank_cameras(item: dict[str, Any], cameras: Sequence[str]) -> dict[str
     images = item["inputs"]["img"]
     intrinsics = meta["cam2img"][0]
     augmentation = meta["img_aug_matrix"][0]
-    # An absent camera has the intrinsics of the first camera, and a pose without sight of the map.
+    # An absent camera has the intrinsics of the first camera, and a pose that is turned away from
+    # the map.
     blank_matrices = {
         "cam2img": intrinsics,
         "img_aug_matrix": augmentation,

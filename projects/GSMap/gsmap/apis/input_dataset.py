@@ -1,4 +1,4 @@
-"""Test data sets of a config with samples from any source."""
+"""Test data sets that are built by a config from samples of any source."""
 
 from collections.abc import Sequence
 from itertools import islice
@@ -23,7 +23,7 @@ _MAX_SAMPLES = 100  # number of samples that are searched for the names of camer
 def open_dataset(
     cfg: Config, source: Source, mount: Mount, ann_file: Path
 ) -> "VectorizedMapDataset":
-    """Open samples as the test data set of a config, with its pipeline.
+    """Open samples as the test data set of a config, with the pipeline of the config.
 
     Samples in another annotation frame are transformed to the annotation frame of the model, if
     the config names it. If the samples have no camera of the config, all of their cameras are used.
@@ -102,10 +102,10 @@ def _annotation_meta(
 
 
 def _select_cameras(cfg: Config, samples: Sequence[MapSample]) -> Sequence[str] | None:
-    """Select the cameras of the config, or all cameras of samples that have none of these.
+    """Select the cameras of the config; all cameras of the samples if they have none of these.
 
     Returns:
-        Names of the cameras; None if the config uses all.
+        Names of the cameras; None if the config names none, which selects all.
     """
     configured = cfg.test_dataloader.dataset.get("cameras")
     available: dict[str, None] = {}  # a set that keeps the order of the names

@@ -1,4 +1,4 @@
-"""A trained model on the cameras of one vehicle, frame by frame."""
+"""Predictions of a trained model from the camera images of one vehicle, frame by frame."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -49,11 +49,11 @@ class Predictor(Protocol):
         """Predict the samples of a data set.
 
         Args:
-            dataset: From ``dataset``.
+            dataset: Data set from the method ``dataset``.
             allow_missing_cameras: Whether cameras of the model may be absent.
             stream: Memory of the earlier frames of the drive; None for independent samples.
             priors: Maps of earlier drives, one for each place.
-            update_priors: Write each sample to ``priors``.
+            update_priors: Whether to write the prediction of each sample to ``priors``.
         """
 
     def elements(self, data_sample: "Det3DDataSample") -> MapElements:
@@ -64,25 +64,26 @@ class LiveMap:
     """Predictor of the map around a vehicle, from images in memory.
 
     Use ``MapInferencer.live`` to create it. The calibration is prepared at the first frame, and
-    again if an image size changes. Frames are independent of each other, unless a stream is given,
-    which holds the memory of a temporal model between frames.
+    again if an image size changes. Frames are independent of each other unless a stream is given. A
+    stream is the memory of a temporal model between frames.
 
     Args:
         inferencer: The trained model.
         intrinsics: Pinhole matrix of each camera in pixels, by name or as a list. (3, 3) each
         cam_from_frame: Transform from the frame to each camera (x right, y down, z ahead) in
             metres, by name or as a list. (4, 4) each
-        frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
-            frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, at the
-            rear axle). By default the frame of the config. The pose of an annotation frame on the
-            vehicle is taken from the training data if the model was trained in this frame, and
-            otherwise from nuScenes (``lidar``) or Argoverse 2 (``ego``).
+        frame: Frame of the calibration. Either ``vehicle`` (x ahead, y left, origin on the road
+            below the rear axle), or an annotation frame: ``lidar`` (x right, y ahead, origin at a
+            roof LiDAR) or ``ego`` (x ahead, y left, origin at the rear axle). By default the frame
+            of the config. The pose of an annotation frame on the vehicle is taken from the training
+            data if the model was trained in this frame, and otherwise from nuScenes (``lidar``) or
+            Argoverse 2 (``ego``).
         allow_missing_cameras: Whether cameras of the model may be absent.
         prior: Map of earlier drives, for a model that reads a prior.
-        update_prior: Write each frame to ``prior`` after it is predicted.
+        update_prior: Whether to write the prediction of each frame to ``prior``.
 
     Raises:
-        ValueError: If a prior is given for a model that reads no prior, or does not fit the model.
+        ValueError: If a prior is given and the model reads no prior, or the prior does not fit it.
     """
 
     def __init__(
@@ -152,9 +153,9 @@ class LiveMap:
                 the training images. (H, W, 3) each
             can_bus: Vehicle signals, as `motion_signals` computes them from poses. Without them, a
                 model that was trained with signals assumes a standing vehicle. (18,)
-            at: Name, scene, time and pose of the frame. Required with ``stream`` and with the prior
-                of this map. The pose is the transform from the frame of the calibration to the
-                world, in metres.
+            at: Name, scene, time and pose of the frame. Required with ``stream``, and always if
+                this `LiveMap` has a prior. The pose is the transform from the frame of the
+                calibration to the world, in metres.
             stream: Memory of the earlier frames of the drive, from ``MapInferencer.new_stream``.
                 For temporal models only.
 
@@ -166,8 +167,8 @@ class LiveMap:
             ValueError: If an array has another shape, a matrix is not a valid intrinsic matrix or
                 pose, or a signal is not finite. If the cameras of the arguments differ from each
                 other or from the cameras of the model. If only one of ``at`` and ``stream`` is
-                given, a stream is given for a model that is not temporal, or the frame is not
-                later than the last frame of the stream.
+                given (``at`` alone is valid with a prior), a stream is given for a model that is
+                not temporal, or the frame is not later than the last frame of the stream.
         """
         has_stream = stream is not None
         has_pose = at is not None
@@ -213,7 +214,8 @@ class LiveMap:
         Args:
             pixels: BGR images by the name of the camera. (H, W, 3) each
         """
-        training_mount = self._inferencer.model.mount  # place of the frame in the training vehicle
+        # Pose of the annotation frame on the vehicle of the training data.
+        training_mount = self._inferencer.model.mount
         mount = training_mount if self._frame == training_mount.frame else None
         source = source_in_memory(
             pixels,

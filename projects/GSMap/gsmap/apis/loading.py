@@ -22,7 +22,8 @@ from gsmap.utils.model_facts import MOUNT, RIG
 
 _LOGGER = logging.getLogger(__name__)
 _USUAL_DATASETS = ("nuscenes", "minicity", "av2")  # data sets with the usual mount of a frame
-# Limits of the values that a checkpoint may contain.
+# Limits of the values that a checkpoint may contain. A mount is the pose of the annotation frame on
+# the vehicle.
 _FARTHEST_M = 100.0  # of the entries of a mount
 _HIGHEST_M = 10.0  # of the height of the ground
 _LARGEST_PX = 1e5  # of the sizes and intrinsics of cameras
@@ -50,7 +51,7 @@ def load_model(
         * ``mount``: Pose of its annotation frame on the vehicle of the training data.
         * ``rig``: Cameras of the training data by name: width, height, fx, fy, cx, cy in pixels.
         * ``training_dataset``: Name of the training's data set; empty if unknown.
-        * ``without_signals``: Whether the training data is known to lack vehicle signals.
+        * ``without_signals``: Whether the training data is known to lack vehicle signals (CAN bus).
 
     Raises:
         FileNotFoundError: If the config or the checkpoint does not exist.
@@ -72,7 +73,7 @@ def load_model(
     model.cfg = cfg
     model.mount = _training_mount(cfg, contents=contents, path=checkpoint)
     # A checkpoint without settings is from an earlier version, which did not record whether the
-    # training data had vehicle signals (CAN bus).
+    # training data had vehicle signals.
     model.without_signals = False
     if contents is not None and contents.settings is not None:
         model.without_signals = not contents.can_bus
@@ -144,7 +145,8 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
     options = cfg.test_dataloader.dataset
     frame = options.get("frame") or "lidar"
     meta = contents.dataset_meta if contents else {}
-    # A mount in the checkpoint is the pose of the frame that the checkpoint names.
+    # A mount in the checkpoint is the pose of the frame that the checkpoint names. It is not used
+    # if the config has another frame.
     names_other_frame = meta.get("frame", frame) != frame
     if names_other_frame or frame not in RANGES:
         return Mount(frame)

@@ -1,4 +1,4 @@
-"""A trained model on recorded samples, with map elements and pictures as results."""
+"""Inference with a trained model on recorded samples, which returns map elements and figures."""
 
 import copy
 import logging
@@ -46,14 +46,14 @@ if TYPE_CHECKING:  # slow to import
     from gsmap.prior.opening import AnyPrior
     from gsmap.visualization.map_visualizer import MapVisualizer
 
-_GENERATED = "minicity"
+_GENERATED = "minicity"  # data set of generated images
 _LOGGER = logging.getLogger(__name__)
 
 
 def select_samples(
     tokens: Sequence[str], wanted: Sequence[str] | None = None, max_num: int | None = None
 ) -> list[int]:
-    """Select samples by token, and at most a number of them, evenly spaced.
+    """Select samples by token, then at most ``max_num`` evenly spaced samples of these.
 
     Args:
         tokens: Tokens of all samples.
@@ -80,7 +80,7 @@ def select_samples(
 
 
 def spread_evenly(count: int, max_num: int | None = None) -> list[int]:
-    """Evenly spaced indices.
+    """Return evenly spaced indices.
 
     Args:
         count: Upper bound of the indices, exclusive.
@@ -199,8 +199,8 @@ class MapInferencer:
     ) -> "VectorizedMapDataset":
         """Create the test data set of the config, with its pipeline, from other samples.
 
-        Samples in another annotation frame are transformed to the frame of the config. If they have
-        no camera of the config, all of their cameras are used.
+        Samples in another annotation frame are transformed to the frame of the config. If the
+        samples have no camera of the config, all cameras of the samples are used.
 
         Args:
             source: An annotation file, a recording of ``mapdata.inputs.open_input``, or samples in
@@ -243,7 +243,7 @@ class MapInferencer:
     def _fit_cameras(
         self, dataset: "VectorizedMapDataset", allow_missing_cameras: bool
     ) -> "VectorizedMapDataset":
-        """Fit the camera embeddings of the model to the cameras of a data set (`camera_rows`).
+        """Select the camera embedding of each camera of a data set (`camera_rows`).
 
         Args:
             dataset: The data set.
@@ -288,8 +288,8 @@ class MapInferencer:
 
         Raises:
             FileNotFoundError: If the file of the sweep does not exist.
-            ValueError: If it is neither in nuScenes' format (five float32 values per point) nor in
-                Argoverse 2's.
+            ValueError: If the file is neither in the format of nuScenes (five float32 values per
+                point) nor in the format of Argoverse 2.
         """
         lidar = dataset.sample(index).lidar
         if lidar is None:
@@ -326,7 +326,7 @@ class MapInferencer:
             allow_missing_cameras: Whether absent cameras of a sample get black images. Cameras that
                 no sample has are left out.
             on_broken: Function that is called with each sample that cannot be used. Such a sample
-                is left out. With None it raises an error.
+                is left out. By default, such a sample raises an error.
             stream: Drive that the samples continue, for a model with memory (`new_stream`); it may
                 be used in several calls. By default each scene starts a new one. The stream is at
                 most a batch ahead of the samples that are yielded.
@@ -486,7 +486,7 @@ class MapInferencer:
         prior: "AnyPrior | None" = None,
         update_prior: bool = False,
     ) -> LiveMap:
-        """Create a function from the images of each frame to its map.
+        """Create a predictor that is called with the images of each frame and returns its map.
 
         Args:
             intrinsics: Pinhole matrix of each camera, in pixels. (3, 3) each

@@ -30,7 +30,7 @@ def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> 
     Args:
         model: A `MapDetector`.
         priors: The priors, one for each place.
-        update: Write the prediction of each frame to the prior of its place.
+        update: Whether to write the prediction of each frame to the prior of its place.
 
     Returns:
         Maps to pass to ``model.prior.use``, or to the context manager ``model.prior.using``. The
@@ -44,7 +44,7 @@ def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> 
 
 
 def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
-    """Let a model read files of priors in its tests, without changing the files.
+    """Let a model read files of priors while it is tested, without changing the files.
 
     Args:
         model: A `MapDetector`.
@@ -65,11 +65,12 @@ def open_priors(
     """Open files of priors until the end of a context.
 
     Args:
-        model: A `MapDetector` with a prior. A new file gets the classes and the cells of the model
-            and its rule for writing predictions.
+        model: A `MapDetector` with a prior module. A new file gets the classes and the cells of the
+            model, and its rule for writing predictions.
         paths: The files.
         stack: Context that closes the priors at its end.
-        update: Reserve the files, to save them later; a file that does not exist is created.
+        update: Whether to reserve the files, so that they can be saved later. A file that does not
+            exist is then created.
         new_place: Name of the place of a file that is created.
 
     Raises:

@@ -28,7 +28,7 @@ POSE_ONLY_RULE = (
 )
 NO_SIGNALS = "not needed: the model was trained without vehicle signals; zeros are taken"
 STREAM_INPUTS = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
-PRIOR_INPUT = "prior"  # window of a map prior, an input of a model that reads one
+PRIOR_INPUT = "prior"  # input of models with a map prior: the part of an earlier map at the vehicle
 # Prefix of the inputs with the memory. The outputs with the new memory start with `new_memory_`.
 MEMORY_PREFIX = "memory_"
 _PRECISIONS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
@@ -41,7 +41,7 @@ class OnnxInferencer:
     Args:
         path: The file.
         providers: Execution providers of ONNX Runtime, in order of preference.
-        num_threads: Number of threads of an operator; 0 uses one per core.
+        num_threads: Number of threads of each operator; 0 for one thread per core.
 
     Attributes:
         classes: Names of the classes.
@@ -51,7 +51,8 @@ class OnnxInferencer:
             no prior. The window covers ``x_range`` and ``y_range`` of the metadata.
         metadata: Metadata of the file. ``ground_from_frame`` (4, 4), if present, is the transform
             in metres from the annotation frame to the ground below the rear axle (x ahead, y left,
-            z up) in the training data. The frame of a vehicle's calibration must have this pose.
+            z up) in the training data. The frame in which a vehicle's cameras are calibrated must
+            have this pose, too.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -171,7 +172,8 @@ class OnnxInferencer:
                 * Models with memory also read ``scene``, ``timestamp_ns`` and ``lidar2global``
                   (4, 4), from the annotation frame to the world in metres.
             stream: Memory of the drive of the sample, for a model with memory: a result of
-                `new_stream`, or of `new_scenes` for samples of several scenes. It is advanced.
+                `new_stream`, or of `new_scenes` for samples of several scenes. The call adds this
+                sample to it.
 
         Returns:
             The elements, best first, with scores and, if the model predicts them, Gaussians.
@@ -197,14 +199,14 @@ class OnnxInferencer:
 
         Args:
             images: Images of the cameras in uint8. (V, H, W, 3)
-            meta: Calibration and pose of the frame, as a call takes them.
+            meta: Calibration and pose of the frame, as in `__call__`.
             stream: Drive of the frame, for a model with memory.
 
         Returns:
             The inputs by their names, in float32.
 
         Raises:
-            ValueError: If an input does not fit, as for a call of the predictor.
+            ValueError: If an input does not fit (see `__call__`).
         """
         self._check_images(images)
         self._check_signals(meta)
@@ -254,10 +256,10 @@ class OnnxInferencer:
         )
 
     def _stream_inputs(self, meta: Mapping[str, Any], stream: Scenes | None) -> dict[str, Any]:
-        """Inputs for the memory after the previous frame and the motion since then.
+        """Inputs with the memory after the previous frame, and with the motion since then.
 
         Args:
-            meta: Pose and time of the frame, as a call takes them.
+            meta: Pose and time of the frame, as in `__call__`.
             stream: Drive of the frame.
         """
         if stream is None or not self.has_memory:
@@ -289,7 +291,7 @@ class OnnxInferencer:
 
         Args:
             stream: Drive of the frame.
-            meta: Pose and time of the frame, as a call takes them.
+            meta: Pose and time of the frame, as in `__call__`.
             outputs: Outputs of `run` for the frame.
         """
         memory = {name: outputs[f"new_{name}"] for name in self._initial_memory}
@@ -318,7 +320,7 @@ class OnnxInferencer:
             inputs: Inputs of `prepare`.
 
         Returns:
-            The outputs by name. Elements outside of the map are included.
+            The outputs by name, with the elements outside of the map.
 
         Raises:
             ValueError: If ONNX Runtime cannot run the graph on these inputs.
@@ -376,7 +378,7 @@ class OnnxInferencer:
         return MapElements.from_polylines(polylines, **fields)
 
     def _unfold(self, fields: dict[str, NDArray[Any]]) -> None:
-        """Reorder the points of elements of ``unfold_classes`` to the shortest lines, in place."""
+        """Reorder the points of each element of ``unfold_classes`` to a short line, in place."""
         unfolded = np.isin(fields["labels"], self.metadata.get("unfold_classes", []))  # (M,)
         if not unfolded.any():
             return

@@ -27,8 +27,8 @@ class ResultLog:
 
     Raises:
         RuntimeError: If another process writes the result file.
-        ValueError: If ``OUT.unfinished`` has another format, is damaged, or has other frames. The
-            file is not changed in this case.
+        ValueError: If ``OUT.unfinished`` has another format, is damaged, or has frames that do not
+            belong to the run. The file is not changed in this case.
 
     Attributes:
         done: Tokens of the finished frames.

@@ -1,4 +1,4 @@
-"""Adaptation of trained models to other cameras, ranges, BEV cells and classes."""
+"""Adaptation of checkpoints to models for other cameras, ranges, BEV cells and classes."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -36,13 +36,14 @@ AZIMUTHS_DEG = {
     "ring_rear_right": -153,
 }  # fmt: skip
 
-# Class embeddings of a generator. They are reordered only if the class weights of its detector are.
+# Class embeddings of a generator of polylines. They are reordered only together with the class
+# weights of a detector.
 _GENERATOR_LABELS = "map_head.generator.label."
-# Prefixes of weights with a row for each class, and the number of rows before the first class.
+# Number of rows before the row of the first class, by the prefix of weights with a row per class.
 _CLASS_ROWS = {
     "map_head.cls_branches.": 0, "map_head.cls_branch.": 0, "map_head.detector.cls_branches.": 0,
     "map_head.detector.cls_branch.": 0, _GENERATOR_LABELS: 0,
-    "map_head.decoder.maps.0.3.": 1,  # the background
+    "map_head.decoder.maps.0.3.": 1,  # row 0 is the background
 }  # fmt: skip
 _MAX_SAMPLES = 100  # number of samples that are searched for one with all cameras
 
@@ -50,8 +51,8 @@ _MAX_SAMPLES = 100  # number of samples that are searched for one with all camer
 def camera_rows(dataset: "VectorizedMapDataset", trained: Sequence[str]) -> list[int]:
     """Assign a camera of the model to each camera of a data set.
 
-    Cameras are assigned by name if the model has cameras of all these names, and by viewing
-    direction if not (`similar_cameras`).
+    Cameras are assigned by name if the model has a camera of each name. Otherwise all of them are
+    assigned by viewing direction (`similar_cameras`).
 
     Args:
         dataset: The data set.
@@ -108,7 +109,7 @@ def similar_cameras(
         azimuth = 0.0
         if name in cameras:
             azimuth = viewing_azimuth(cameras[name].cam_from_frame, FRAME_VIEWS[frame])
-        similarity = np.cos(trained_azimuths - azimuth)
+        similarity = np.cos(trained_azimuths - azimuth)  # largest for the nearest direction
         rows.append(int(np.argmax(similarity)))
     return rows
 
@@ -175,7 +176,7 @@ def _fit_cameras(
     if trained is None or len(trained) != len(embeds):
         if len(embeds) == num_cameras:
             return []
-        trained = ()  # unknown
+        trained = ()  # no known names
     names = _camera_names(dataset)
     names_are_known = set(names) <= set(trained)
     directions_are_known = bool(trained) and set(trained) <= AZIMUTHS_DEG.keys()
@@ -225,9 +226,9 @@ def _fit_cells(state: dict[str, Tensor], initial: Mapping[str, Tensor]) -> list[
 def _fit_queries(
     state: dict[str, Tensor], initial: Mapping[str, Tensor], model: nn.Module
 ) -> list[str]:
-    """Append initial queries if the checkpoint has fewer queries than the model.
+    """Append queries from the initial weights if the checkpoint has fewer than the model.
 
-    This is done only for models with one group of queries.
+    Only models with one group of queries are changed.
 
     Args:
         state: Weights of the checkpoint; changed in place.
@@ -257,7 +258,7 @@ def _fit_classes(
     trained: Sequence[str] | None,
     names: Sequence[str],
 ) -> list[str]:
-    """Reorder the rows of classes by name. Classes without weights keep the model's initial rows.
+    """Reorder the rows of classes by name. Classes new to the checkpoint keep their initial rows.
 
     Args:
         state: Weights of the checkpoint; changed in place.
@@ -273,7 +274,7 @@ def _fit_classes(
     first_rows = _find_class_weights(
         state, initial=initial, old_count=len(trained), new_count=len(names)
     )
-    # Without weights of classes, or with embeddings of a generator alone, nothing is reordered.
+    # Nothing is reordered if there are no class weights, or only the embeddings of a generator.
     if all(key.startswith(_GENERATOR_LABELS) for key in first_rows):
         return [
             f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
@@ -327,7 +328,7 @@ def _find_class_weights(
 
 @HOOKS.register_module()
 class RigFitHook(Hook):
-    """Hook that fits the initial checkpoint of a training to cameras, range, cells and classes.
+    """Hook that fits the initial checkpoint of a training to the model (`fit_start`).
 
     Each change is logged. Checkpoints of resumed trainings and of tests are not changed.
     """
@@ -356,10 +357,10 @@ class RigFitHook(Hook):
 
 
 def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Facts about the training of a checkpoint, for `fit_start`.
+    """Collect facts about the training of a checkpoint, for `fit_start`.
 
-    The source is the metadata of the checkpoint, or the config of a named model if its checkpoint
-    has no metadata. Facts of a wrong type are left out.
+    They are taken from the metadata of the checkpoint. If the checkpoint of a named model has no
+    metadata, they are taken from the model's config. Facts of a wrong type are left out.
 
     Args:
         path: File of the checkpoint.
@@ -378,7 +379,7 @@ def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
         value = metadata.get(name)
         if not isinstance(value, list | tuple | str):
             continue
-        # The items of a text, such as the name of the frame, are its characters.
+        # The items of a string, such as the name of the frame, are its characters.
         if all(isinstance(item, item_type) for item in value):
             facts[name] = value
     return facts

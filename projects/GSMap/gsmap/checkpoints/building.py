@@ -1,4 +1,4 @@
-"""Errors of configs: configs that cannot be read, and settings that do not fit their classes."""
+"""Clear errors for configs that cannot be read, and for settings that do not fit their classes."""
 
 import re
 import traceback
@@ -16,9 +16,9 @@ from gsmap.utils.faults import registry_names, suggestion, user_message
 from gsmap.utils.overrides import find_override
 from gsmap.utils.shipped import shipped_path
 
-_BUILDER = build_from_cfg.__code__  # every registry calls it, also registries inside of classes
+_BUILDER = build_from_cfg.__code__  # every registry builds its objects with this function
 _RUNNER = "mmengine.runner.runner"  # compared by name, since importing the runner is slow
-_CONFIGS = "mmengine.config"
+_CONFIGS = "mmengine.config"  # package whose modules read configs
 _SETTINGS_ERRORS = (
     ValueError, TypeError, LookupError, RuntimeError, AttributeError, AssertionError,
     ArithmeticError, ImportError,
@@ -28,7 +28,7 @@ _ABSENT_TYPE = re.compile(r"(\S+) is not in the .+? registry")
 
 
 class _Part(NamedTuple):
-    """Part of a config under construction: settings with a ``type``, or an object of the runner.
+    """Part of a config that is being built: settings with a ``type``, or an object of the runner.
 
     Attributes:
         registry: Registry that builds the part; None for a part that is built without one.
@@ -68,7 +68,7 @@ def reading_config(source: object) -> Iterator[None]:
         reason: BaseException = error
         if isinstance(error, ImportError) and error.__context__ is not None:
             reason = error.__context__  # mmengine's ImportError omits the cause
-        # mmengine reads ``scope::config`` in _base_ for a fixed list of scopes, without gsmap.
+        # In _base_, mmengine reads ``scope::config`` for a fixed list of scopes that lacks gsmap.
         if "load gsmap config" in str(reason):
             reason = ValueError(
                 f"'gsmap::' is not read in _base_; write a path below {shipped_path('configs')} "
@@ -88,11 +88,12 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
 
     Args:
         cfg: The config.
-        kind: Class that the block builds from settings without a registry.
+        kind: Class that the block builds from settings directly, without a registry; None if there
+            is no such class.
 
     Raises:
         ValueError: In place of an exception that the settings cause. A `GsmapError` keeps its
-            class. Errors of the machine, for example of memory, are not changed.
+            class. Errors of the machine, such as a lack of memory, are not changed.
     """
     where = f"{cfg.filename}: " if cfg.filename else ""
     try:
@@ -108,7 +109,7 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
         parts = _parts_under_construction(error)
         if kind is not None:
             parts.append(_Part(registry=None, kind=kind))
-        # An error of the machine has a message for users already.
+        # Errors of the machine are not changed: `user_message` already describes them to users.
         fault = None if user_message(error) else _describe_fault(error, parts=parts, cfg=cfg)
         if fault is None:
             raise
@@ -156,8 +157,8 @@ def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> st
     if isinstance(error, KeyError) and error.args:
         text = str(error.args[0])  # without the quotes of a KeyError
     scope = _frames(error)[0].f_globals  # names of the module that raised the error
-    of_config = scope.get("__name__", "").startswith(_CONFIGS)
-    if of_config and isinstance(error, KeyError | AttributeError):
+    is_config_error = scope.get("__name__", "").startswith(_CONFIGS)
+    if is_config_error and isinstance(error, KeyError | AttributeError):
         return f"a setting is missing: {text}."
     if not parts:
         return None
@@ -173,7 +174,8 @@ def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> st
         hint = suggestion(absent[1], names=registry_names(registry)) or "."
         return f"there is no {registry.name} of type {absent[1]!r}{hint}"
     subject = " of ".join(part.name for part in typed_parts) or "the run"
-    # The override of the command line that the error is about, or the dotted name of the settings.
+    # Place of the fault: the override of the command line that caused the error, or else the dotted
+    # name of the settings of the part.
     place = find_override(error) or _find_place(cfg, parts=parts)
     settings = f"these settings ({place})" if place else "these settings"
     if type(error) is ValueError:  # raised by the checks of a library's class

@@ -1,6 +1,6 @@
-"""Conversion of state dicts between the formats of the earlier systems and of this project.
+"""Conversion of state dicts between the format of this project and the upstream format.
 
-"Upstream" is the code of the authors of a model.
+"Upstream" is the code that the authors of a model have released.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ _TRAINING_ONLY = "map_head.aux_heads."  # prefix of weights that only training u
 
 
 def summarize_names(names: Sequence[str], max_names: int = 3) -> str:
-    """Join the first names for a message, and count the rest.
+    """Join the first names for a message, and append the number of further names.
 
     Args:
         names: State keys, or other names.
@@ -30,13 +30,14 @@ def summarize_names(names: Sequence[str], max_names: int = 3) -> str:
 def ours_from_upstream(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Rename the keys of an upstream state to the keys of this project.
 
-    Keys that the key map marks as unused are left out.
+    The key map (`KeyMap`) of the architecture has the rules of the names. Keys that it marks as
+    unused are left out.
 
     Args:
         state: Weights by upstream key.
 
     Raises:
-        ValueError: If the key map of the state's architecture does not contain a key.
+        ValueError: If the key map does not contain a key.
     """
     key_map = find_key_map(state)
     renamed: dict[str, Tensor] = {}
@@ -78,7 +79,7 @@ def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             f"keys that upstream's {key_map.name} does not have: {summarize_names(unknown)}. "
             "Without these weights the model would predict other maps, so it is not converted."
         )
-    # `unused` has a constant weight, or None, for each key that only upstream has.
+    # For each key that only upstream has, `unused` contains a constant weight, or None.
     for key, constant in key_map.unused.items():
         if constant is not None:  # None marks a key that only some upstream models have
             # Some constants are expanded tensors, whose elements share memory.
@@ -90,7 +91,7 @@ def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     """Convert a state from either format to the other.
 
     Args:
-        state: Weights in the format of an earlier system or of this project.
+        state: Weights by the keys of upstream or of this project.
 
     Returns:
         The converted state, and a description of the conversion for a log.

@@ -1,4 +1,4 @@
-"""Key rules of EfficientNet-B0: the names of ``efficientnet_pytorch`` and of mmdet."""
+"""Rules that map the keys of EfficientNet-B0 between ``efficientnet_pytorch`` and mmdet."""
 
 from torch import Tensor
 
@@ -16,7 +16,7 @@ def efficientnet_rules(theirs: str, ours: str) -> Rules:
         ours: Prefix of the keys of this project.
 
     Returns:
-        Pairs of key prefixes: upstream's and the one of this project.
+        Pairs of key prefixes: first the upstream prefix, then the prefix in this project.
     """
     # Each entry of `names` is the upstream name, "=", and the name in this project.
     rules = rules_of(upstream=theirs, ours=f"{ours}layers.0.", names="_conv_stem.=conv. _bn0.=bn.")
@@ -38,7 +38,7 @@ def efficientnet_rules(theirs: str, ours: str) -> Rules:
 
 
 def norm_shapes(prefix: str, channels: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the state of a batch normalisation.
+    """Shapes of the parameters and statistics of a batch normalisation layer.
 
     Args:
         prefix: Prefix of the keys, with its dot.

@@ -1,4 +1,4 @@
-"""Key maps of all map models, between the state keys of their authors' code and of this project."""
+"""Key maps of all map models: their state keys in the authors' code and in this project."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -15,8 +15,9 @@ from gsmap.utils.errors import InputError
 def key_maps() -> tuple[KeyMap, ...]:
     """Key maps of all map models in `METHODS`, the most special first; maps without markers last.
 
-    ``gsmap/models/<method>/keys.py`` has the maps of a model in ``KEY_MAPS``. A model without such
-    a file has no published checkpoints.
+    A marker is a prefix of a key by which a model is recognised. The maps of a model are in
+    ``KEY_MAPS`` of ``gsmap/models/<method>/keys.py``. A model without such a file has no published
+    checkpoints.
     """
     num_users: Counter[str] = Counter()
     for method in METHODS:

@@ -1,6 +1,6 @@
-"""Rules between the state keys of an earlier system and of this project, for both directions.
+"""Rules that rename the state keys of upstream code to the keys of this project, and back.
 
-The earlier system, the code of the authors of a model, is called "upstream".
+"Upstream" is the code that the authors of a model published.
 """
 
 import re
@@ -21,17 +21,16 @@ class KeyMap:
     Attributes:
         name: Name of the architecture.
         rules: Key prefixes in pairs (upstream, here). ``{i}`` stands for a number; the numbers
-            of both sides are equal, in order. The first rule that matches is applied.
+            of both sides are equal and in equal order. The first rule that matches is applied.
         unused: Upstream keys without a counterpart here, with the values that conversion to
-            upstream's format writes; None for a key that only some upstream models have. They take
-            precedence over ``rules``.
+            upstream's format writes; None for a key that only some upstream models have. These keys
+            take precedence over ``rules``.
         markers: Key prefixes in pairs (upstream, here). If all of them are present, the keys
             belong to this architecture, not to one that it is built on. The empty prefix of
             the default is present in every key.
         ignored_pattern: Regular expression of further upstream keys without a counterpart, which
             conversion back leaves out. The default matches nothing.
-        upstream_prefix: Prefix that only keys in upstream's format have, for telling the two
-            formats apart.
+        upstream_prefix: Prefix that only keys in upstream's format have. It identifies the format.
     """
 
     name: str
@@ -86,12 +85,13 @@ def _rename(key: str, rules: Rules) -> str | None:
 
 
 def rules_of(upstream: str, ours: str, names: str) -> Rules:
-    """Rules for several names below a pair of prefixes.
+    """Make rules for several keys with common prefixes.
 
     Args:
         upstream: Prefix of upstream's keys.
         ours: Prefix of the keys of this project.
-        names: Rest of the keys, separated by blanks: ``theirs=ours``, or one name for both.
+        names: Remainders of the keys, separated by blanks. Each is ``theirs=ours``, or one name if
+            both are equal.
     """
     rules: list[tuple[str, str]] = []
     for name in names.split():
@@ -101,10 +101,12 @@ def rules_of(upstream: str, ours: str, names: str) -> Rules:
 
 
 def zeros(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    """Zeros for parameters without effect on any output. They take no memory.
+    """Make zeros for parameters that have no effect on any output.
+
+    Each tensor is expanded from one value, so it takes almost no memory.
 
     Args:
         prefix: Prefix of the keys.
-        shapes: Shapes by the rest of the key.
+        shapes: Shapes by the remainder of the key.
     """
     return {prefix + key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}

@@ -26,7 +26,7 @@ class NamedModel:
     Attributes:
         name: Name of the model.
         config: Path of the config in the repository.
-        sha256: Digest of the weights' file; None if it is unknown.
+        sha256: SHA-256 digest of the weights' file; None if it is unknown.
         source: Authors of the weights, or address of their project.
         licence: Licence of the weights.
         address: Download address of the weights; None for models that ship.
@@ -155,8 +155,7 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
 
     Raises:
         FileNotFoundError: If the checkpoint does not exist.
-        ValueError: If ``checkpoint`` is None and ``config`` is a config without the name of a
-            model.
+        ValueError: If ``checkpoint`` is None and ``config`` refers to a config, but not to a model.
     """
     if checkpoint is not None:
         return find_checkpoint(checkpoint)

@@ -65,8 +65,8 @@ def load_published(
         The checkpoint, with the keys of mmdet's backbones (`in_our_names`).
 
     Raises:
-        OSError: If the file is neither available nor can be downloaded.
-        ValueError: If it cannot be read. A downloaded file is removed in this case.
+        OSError: If the file is not available and cannot be downloaded.
+        ValueError: If the file cannot be read. A downloaded file is removed in this case.
     """
     path = find_weights(address)
     try:
@@ -89,7 +89,7 @@ def load_from_file(path: str, map_location: Any = "cpu") -> Any:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it cannot be read.
+        ValueError: If the file cannot be read.
     """
     file = Path(path).expanduser()
     if not file.is_file():
@@ -102,7 +102,7 @@ def load_from_torchvision(name: str, map_location: Any = "cpu") -> Any:
     """Load the weights of ``torchvision://NAME`` without torchvision; a loader for mmengine.
 
     Args:
-        name: Name of the weights, with its scheme.
+        name: Name of the weights with its scheme, ``torchvision://NAME``.
         map_location: Device, as torch takes it.
 
     Raises:
@@ -119,15 +119,15 @@ def load_from_torchvision(name: str, map_location: Any = "cpu") -> Any:
 def find_weights(address: str) -> Path:
     """Find the file of published weights, and download it if it is not available.
 
-    A published file name may end in the first digits of the file's sha256. If the digest of a
-    downloaded file differs from them, the file is downloaded again. If the digest of a file in the
-    folder of ``GSMAP_WEIGHTS`` differs, a warning is logged.
+    A published file name may end in the first digits of the file's sha256. If a file in the cache
+    does not have these digits, it is downloaded again. If a file in the folder of ``GSMAP_WEIGHTS``
+    does not have them, it is used with a warning.
 
     Args:
         address: Address of the published file.
 
     Raises:
-        OSError: If the file is neither available nor can be downloaded.
+        OSError: If the file is not available and cannot be downloaded.
     """
     name = _published_name(address)
     folder = os.environ.get(WEIGHTS)
@@ -194,7 +194,7 @@ def _download(address: str, path: Path) -> None:
 
 
 def _read_blocks(address: str) -> Iterator[bytes]:
-    """Yield the blocks of a file on the network, for at most `LIMIT_S`."""
+    """Download a file in blocks, for at most `LIMIT_S`."""
     end_s = time.monotonic() + LIMIT_S
     try:
         with _open_address(address) as response:
@@ -215,8 +215,8 @@ def _read_blocks(address: str) -> Iterator[bytes]:
 def _open_address(address: str) -> HTTPResponse:
     """Connect to a server and read the header of its response, both within `HEADER_S`.
 
-    The timeout of a socket restarts with each byte, so a second thread opens the connection, and
-    this one waits for it.
+    The timeout of a socket restarts with each byte, so it cannot limit the total time. Therefore a
+    second thread opens the connection, and this thread waits for at most `HEADER_S`.
     """
     responses: SimpleQueue[HTTPResponse | Exception] = SimpleQueue()
 
@@ -257,8 +257,8 @@ def in_our_names(checkpoint: Any) -> Any:
         checkpoint: Contents of the published file.
 
     Returns:
-        The weights by their new keys. Contents in another format keep their keys. They are returned
-        as they are, or as the value of ``model`` if they have ``model`` but no ``state_dict``.
+        The weights by their new keys. Contents in another format are returned unchanged, except
+        that contents with ``model`` and without ``state_dict`` are replaced by their ``model``.
     """
     if not isinstance(checkpoint, Mapping):
         return checkpoint

@@ -1,4 +1,4 @@
-"""Reading of checkpoints, and loading into a model. Every error contains a remedy."""
+"""Reading of checkpoints, and loading of their weights. Every error message contains a remedy."""
 
 import json
 import pickle
@@ -43,7 +43,7 @@ _DAMAGE = (
     RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, ValueError,
     ArithmeticError, OSError, zipfile.BadZipFile,
 )  # fmt: skip
-# Beginnings of the overrides that set the scale of test images.
+# Beginnings of the names of overrides that set the scale of test images.
 _SCALE_OPTIONS = ("image_scale", "test_dataloader.dataset.pipeline")
 _WIDEST_PX = 100_000
 _REMEDY = "if you trust its origin, save its state_dict alone and give that file."
@@ -55,14 +55,15 @@ class Checkpoint:
 
     Attributes:
         state: Weights by state key.
-        settings: Settings of the model in training, not checked; None if the file has none.
+        settings: Settings of the model during training, not checked; None if the file has none.
         image_size: Width and height of the training images after scaling, in pixels; None if
             unknown.
         can_bus: Whether the training samples had vehicle signals; False if unknown.
-        trained_on: Data set of the training and identity of its list of scenes; empty if unknown.
+        trained_on: Name of the training's data set, and identity of its list of scenes; each is
+            empty if unknown.
         dataset_meta: Metadata of the training's data set, not checked.
-        calibration: Distribution of the errors and interval to which the sigmas of the Gaussians
-            were fitted (`calibration_of`); empty if they were not fitted.
+        calibration: Result of `calibration_of`: the distribution of errors and the interval to
+            which the sigmas of the Gaussians were fitted; empty if they were not fitted.
     """
 
     state: dict[str, Tensor]
@@ -81,7 +82,7 @@ class Checkpoint:
 
 @contextmanager
 def refusing(path: object) -> Iterator[None]:
-    """Turn errors of reading a checkpoint into one line with its path, the reason and a remedy.
+    """Context manager that adds the path, the reason and a remedy to errors of reading.
 
     Args:
         path: File or address of the checkpoint.
@@ -98,8 +99,8 @@ def refusing(path: object) -> Iterator[None]:
         default = f"it is broken, or holds more than tensors and plain data ({reason}); {_REMEDY}"
         raise InputError(f"{path} was not loaded: {_remedy_for(path, default=default)}.") from error
     except _DAMAGE as error:
-        # Full memory or a failing disk is not a fault of the file, unless torch tried to allocate
-        # more than the whole file, as a damaged size makes it do.
+        # Full memory or a failing disk is not a fault of the file. However, if torch tried to
+        # allocate more than the whole file, a size in the file is damaged.
         if is_machine_error(error) and not _exceeds_file_size(error, path=Path(str(path))):
             raise
         default = "fetch it again, or use the checkpoint of an earlier epoch"
@@ -142,9 +143,9 @@ def load_tensors(path: str | Path, map_location: Any = "cpu") -> Any:
         Tensors and plain data.
 
     Raises:
-        ValueError: If the file is an archive with compressed or overlapping parts. Their sizes in
-            memory have no bound, and torch writes neither.
-        UnpicklingError: If it contains other objects than tensors and plain data.
+        ValueError: If the file is an archive with compressed or overlapping parts. Such a small
+            file can fill the memory, and torch never writes one.
+        UnpicklingError: If it contains objects other than tensors and plain data.
     """
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
@@ -206,7 +207,7 @@ def read_checked(path: str | Path) -> Checkpoint:
 
 
 def _facts_of_named_model(path: Path) -> dict[str, Any]:
-    """Fields of the entry in `named_models` for a file; empty for a file without an entry."""
+    """Return the fields of a file's entry in `named_models`; empty without an entry."""
     for model in named_models().values():
         if model.file == path:
             return vars(model)
@@ -214,7 +215,7 @@ def _facts_of_named_model(path: Path) -> dict[str, Any]:
 
 
 def _check_image_size(size: Any) -> tuple[int, int] | None:
-    """Check an image size of a file.
+    """Check the image size that a file contains.
 
     Raises:
         TypeError: If it is neither None nor a width and a height.
@@ -257,13 +258,13 @@ def adopt_settings(
     cfg_options: dict | None,
     checkpoint: Checkpoint | None = None,
 ) -> list[str]:
-    """Set the model settings of a config to the settings of a checkpoint's training.
+    """Set the model settings of a config to the settings with which a checkpoint was trained.
 
-    Test images are scaled to the size of the training images unless ``cfg_options`` set the scale.
-    If the training samples had vehicle signals, signals are computed from poses where test samples
-    lack them. Settings that only training uses (`TRAINING_SETTINGS`) and ``temporal.elements`` keep
-    the values of the config. Loading refuses a checkpoint that lacks weights of the resulting
-    model, unless the config sets ``model.allow_untrained``.
+    Settings that only training uses (`TRAINING_SETTINGS`) and ``temporal.elements`` keep the values
+    of the config. Test images are scaled to the size of the training images unless ``cfg_options``
+    set the scale. If the training samples had vehicle signals, the signals of test samples without
+    them are computed from poses. Loading a checkpoint that lacks weights of the resulting model
+    raises an error, unless the config sets ``model.allow_untrained``.
 
     Args:
         cfg: The config; its ``model`` and ``test_dataloader`` are changed.
@@ -272,8 +273,8 @@ def adopt_settings(
         checkpoint: Contents of the checkpoint; by default they are read from ``path``.
 
     Returns:
-        A line for each setting of the config that is changed, and for each override that differs
-        from the checkpoint.
+        A line of text for each setting of the config that is changed, and for each override that
+        differs from the checkpoint.
 
     Raises:
         ValueError: If the settings do not describe a model, or are not allowed (`check_settings`).
@@ -284,8 +285,8 @@ def adopt_settings(
     overrides = cfg_options or {}
     _adopt_test_data(cfg, checkpoint=checkpoint, overrides=overrides)
     config = plain(cfg.model.to_dict())
-    # The settings of the checkpoint replace ``cfg.model`` below, but only the config may allow
-    # missing weights.
+    # The settings of the checkpoint replace ``cfg.model`` below. The value of ``allow_untrained``
+    # is kept, because only the config may allow missing weights.
     allow_untrained = cfg.model.setdefault("allow_untrained", False)
     if settings is None or not differences(settings, others=config):
         return []
@@ -333,7 +334,7 @@ def _is_training_setting(name: str) -> bool:
 def _build_settings(
     path: str | Path, settings: Any, config: dict[str, Any], overrides: dict[str, Any]
 ) -> tuple[dict[str, Any], ConfigDict]:
-    """Check the settings of a checkpoint, and that they build a model with the overrides.
+    """Check the settings of a checkpoint, and that a model can be built with the overrides.
 
     Args:
         path: File of the checkpoint.
@@ -342,7 +343,7 @@ def _build_settings(
         overrides: Overrides of the user by dotted name.
 
     Returns:
-        The settings without and with the overrides.
+        The settings without the overrides, and the settings with the overrides.
     """
     try:
         settings = check_settings(settings, config=config)

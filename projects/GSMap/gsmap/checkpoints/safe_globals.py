@@ -1,4 +1,4 @@
-"""Globals that checkpoints of mmengine may refer to, besides tensors and plain data."""
+"""Classes and functions that checkpoints of mmengine may refer to when they are unpickled."""
 
 import pickle
 from collections.abc import Callable
@@ -10,12 +10,13 @@ from gsmap.utils.numpy_pickle import CHECKED
 
 
 def mmengine_globals() -> list[Any]:
-    """Globals that ``torch.load(weights_only=True)`` needs for mmengine's checkpoints.
+    """List the globals that ``torch.load(weights_only=True)`` needs for mmengine's checkpoints.
 
-    A checkpoint for resuming contains mmengine's message hub: ``HistoryBuffer`` objects with
-    arrays, numbers, and references to statistics of the class
-    (``getattr(HistoryBuffer, "mean")``). Torch refuses all other globals. Arrays are rebuilt by
-    functions that check their arguments, because numpy's functions give a file access to memory.
+    A global is a class or function that a pickle file refers to by name; torch refuses globals that
+    are not listed. A checkpoint for resuming contains mmengine's message hub. The hub consists of
+    numbers and of ``HistoryBuffer`` objects, which contain arrays and references to methods of the
+    class (``getattr(HistoryBuffer, "mean")``). Arrays are rebuilt by functions that check their
+    arguments, because a malicious file could access memory through numpy's functions.
 
     Returns:
         Classes, and pairs of a function and the global name that it replaces.
@@ -25,7 +26,7 @@ def mmengine_globals() -> list[Any]:
 
 
 def _history_statistic(owner: type, name: str) -> Callable[..., float]:
-    """Replacement for ``getattr`` in unpickling, restricted to statistics of ``HistoryBuffer``."""
+    """Replacement for ``getattr`` in unpickling; allows only statistics of ``HistoryBuffer``."""
     if owner is not HistoryBuffer or name not in {"min", "max", "current", "mean"}:
         raise pickle.UnpicklingError(f"A checkpoint must not look up {name!r} of {owner!r}.")
     return getattr(HistoryBuffer, name)

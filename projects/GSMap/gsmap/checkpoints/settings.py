@@ -10,7 +10,8 @@ from mmengine.config import Config, ConfigDict
 
 from gsmap.utils.errors import InputError
 
-# Key in a checkpoint's meta. The value is JSON, because the text of a config is run as code.
+# Key in a checkpoint's meta. The value is JSON, and not the text of a config, because such a text
+# is run as code.
 MODEL_SETTINGS = "model_settings"
 # Settings that only training uses, such as initial weights. `check_settings` removes them from the
 # settings of a checkpoint, because some of them load files.
@@ -177,9 +178,10 @@ def _check_type(kind: Any, name: str, known: set[str]) -> Any:
 def _find_registered(kind: str) -> Any:
     """Find a class in the registries by name; None if it is absent.
 
-    A name with a scope is searched in the registries of that scope, such as ``mmdet`` in
-    ``mmdet.DETRHead``. A name without scope is searched in mmdet3d's registries and in mmengine's,
-    which are their roots. Only modules of the registries' packages are imported.
+    A name with a scope, such as ``mmdet`` in ``mmdet.DETRHead``, is looked up in the registries of
+    this scope. A name without a scope is looked up in the registries of mmdet3d and in their roots,
+    which are the registries of mmengine. Only modules of the packages of these registries are
+    imported.
     """
     scope, _, bare_name = kind.rpartition(".")
     for registry in (MODELS, TASK_UTILS):

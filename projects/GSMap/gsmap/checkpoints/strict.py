@@ -10,7 +10,7 @@ from gsmap.utils.errors import InputError
 
 
 class AddsWeights:
-    """Mixin for a module that adds weights to a model. Checkpoints without them can be loaded.
+    """Mixin for a module that adds weights to a model. A checkpoint may lack these weights.
 
     Attributes:
         neutral_keys: Prefixes, relative to the module, of the state keys of additional weights.
@@ -21,7 +21,7 @@ class AddsWeights:
 
 
 def neutral_keys(model: nn.Module, prefix: str = "") -> list[set[str]]:
-    """State keys that the modules of a model declare neutral (`AddsWeights`).
+    """State keys of weights that a checkpoint may lack (`AddsWeights.neutral_keys`).
 
     Args:
         model: The model.

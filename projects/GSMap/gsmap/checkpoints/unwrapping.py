@@ -15,13 +15,13 @@ _OUTER_PREFIXES = ("model.", "network.", "net.")  # removed if all keys start wi
 _PARALLEL_PREFIX = "module."  # of parallel training; removed only at the start of a key
 _WRAPPER_PARTS = ("_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module")
 _AVERAGED = "ema_"  # prefix of keys of exponential moving averages of weights
-_MAX_KEYS_SHOWN = 8  # number of keys that a message names
+_MAX_KEYS_SHOWN = 8  # largest number of keys in a message
 _MOST_REPEATED = 4  # largest ratio of the bytes of all weights to the stored bytes
 _SPARE_BYTES = 1 << 26  # number of bytes that may be repeated in addition
 
 
 class UnfitError(InputError):
-    """Error of a checkpoint without usable weights; the message continues the file's name."""
+    """Error of a checkpoint without usable weights. Its message follows the name of the file."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ def unwrap(content: Any) -> Unwrapped:
     left_out: dict[str, int] = {}
     if len(weights) < len(entries):
         left_out["entries that are no tensors"] = len(entries) - len(weights)
-    # Without dots, the weights are of a single module, and a single number may be one of them.
+    # Single numbers such as the epoch are counters. But if no key has a dot, the weights belong to
+    # one module without submodules, and a single number may be a weight.
     if _has_dotted_key(weights):
         counters = [key for key, value in weights.items() if _is_counter(key, value=value)]
         if counters:
@@ -139,7 +140,7 @@ def _find_state(content: Any, depth: int) -> Mapping[str, Any] | None:
 
 
 def _is_state(value: Any) -> bool:
-    """Whether a value is a mapping from strings to tensors, and to no other mappings."""
+    """Whether a value is a mapping from strings with a tensor and without nested mappings."""
     if not isinstance(value, Mapping):
         return False
     has_tensor = False

@@ -18,7 +18,7 @@ def _array(values: Any) -> npt.NDArray[Any]:
 
 
 def _polylines(instances: Any) -> Any:
-    """Return ``pts`` (N, P, 2); with ``num_pts``, a list of its lines cut to these lengths."""
+    """Return ``pts`` (N, P, 2), or a list of lines cut to ``num_pts`` points if this key exists."""
     points = _array(instances["pts"])
     if "num_pts" not in instances:
         return points

@@ -11,10 +11,10 @@ from gsmap.utils.faults import is_machine_error
 
 
 class BrokenSampleError(InputError):
-    """Sample with a file that is missing, damaged or empty.
+    """Error for a sample with a file that is missing, damaged or empty.
 
-    With ``broken_samples="raise"``, the data set raises the error; with ``"skip"``, it skips and
-    counts the sample.
+    A data set with ``broken_samples="raise"`` raises the error. With ``"skip"``, it skips the
+    sample and counts it.
     """
 
 
@@ -28,20 +28,21 @@ _CONTENT_ERRORS = (
 def explain_errors(subject: object, remedy: str) -> Iterator[None]:
     """Context manager that adds the name of a file and a remedy to errors about its content.
 
-    Errors of the system, such as a lack of memory, and errors whose message contains the name pass
-    unchanged.
+    Two kinds of errors are not changed: errors of the system, such as a lack of memory, and errors
+    whose message already contains the name.
 
     Args:
-        subject: Path or name of the data, the beginning of the message.
-        remedy: Advice to the user, the end of the message.
+        subject: Path or name of the data, with which the message begins.
+        remedy: Advice to the user, with which the message ends.
 
     Raises:
-        ValueError: In place of an error of indexing, arithmetic or a parser within the block.
+        ValueError: If the block raises an error that the content of a file can cause, such as an
+            error of indexing, arithmetic or a parser.
     """
     try:
         yield
     except Exception as error:
-        from_devkit = type(error) is Exception  # nuScenes' devkit raises no subclass
+        from_devkit = type(error) is Exception  # nuScenes' devkit raises plain `Exception`
         from_arrow = type(error) is OSError and error.errno is None  # Arrow, for a damaged file
         is_about_content = isinstance(error, _CONTENT_ERRORS) or from_devkit or from_arrow
         has_name = str(subject) in str(error)

@@ -18,6 +18,7 @@ from gsmap.utils.files import fetch_advice
 # The import registers the formats in pillow; no other format is opened.
 _PLUGINS = (JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin)
 FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
+# First bytes of a file by format.
 _STARTS = {b"\xff\xd8": "jpeg", b"\x89PNG": "png", b"RIFF": "webp", b"BM": "bmp"}
 _JPEG_START = b"\xff\xd8"
 _ORIENTATION_ENTRIES = (b"Exif\0\0", b"tiff:Orientation")  # EXIF and XMP may have an orientation
@@ -99,8 +100,8 @@ def decode_image(
 ) -> np.ndarray:
     """Decode and check the content of an image file.
 
-    A warning of the JPEG decoder is an error too: OpenCV fills missing parts with grey without a
-    message.
+    A warning of the JPEG decoder is raised as an error. OpenCV would fill missing parts with grey
+    without a message.
 
     Args:
         content: Content of the file.
@@ -205,7 +206,7 @@ def _no_image(where: str, path: object, content: bytes) -> str:
 def _decode_jpeg(
     content: bytes, size: tuple[int, int] | None
 ) -> tuple[tuple[int, int], np.ndarray | None]:
-    """Return (width, height) of a JPEG and its pixels, BGR; no pixels if ``size`` differs."""
+    """Return (width, height) and BGR pixels of a JPEG; no pixels (None) if ``size`` differs."""
     if any(entry in content for entry in _ORIENTATION_ENTRIES):
         with Image.open(BytesIO(content), formats=FORMATS) as picture:
             _require_upright(picture)
@@ -222,7 +223,7 @@ def _decode_jpeg(
 def _decode_other(
     content: bytes, size: tuple[int, int] | None
 ) -> tuple[tuple[int, int], np.ndarray | None]:
-    """Return (width, height) of an image and its pixels, BGR; no pixels if ``size`` differs."""
+    """Return (width, height) and BGR pixels of an image; no pixels (None) if ``size`` differs."""
     with Image.open(BytesIO(content), formats=FORMATS) as picture:
         if size not in (None, picture.size):
             return picture.size, None

@@ -26,7 +26,7 @@ def bgr_by_name(images: Cameras) -> dict[str, np.ndarray]:
 
     Raises:
         TypeError: If an image is not uint8.
-        ValueError: If an image has another shape.
+        ValueError: If the shape of an image is not (H, W, 3).
     """
     return {name: _bgr(name, image) for name, image in _by_name(images).items()}
 
@@ -51,8 +51,8 @@ def source_in_memory(
             for the frame ``vehicle``.
 
     Raises:
-        ValueError: If an array has another shape, a matrix is not a valid calibration, or the
-            arguments have different cameras.
+        ValueError: If an array has a wrong shape, a matrix is not a valid calibration, ``frame`` is
+            unknown, or the arguments have different cameras.
     """
     frames = (VEHICLE, *RANGES)  # RANGES has a key for each annotation frame: lidar, ego
     if frame not in frames:
@@ -84,7 +84,8 @@ def source_in_memory(
     )
     check_samples([sample], AnnotationMeta("memory", frame=annotation_frame, split="test"))
     if frame == VEHICLE:
-        # The cameras are known relative to the ground, and are transformed to the frame ego.
+        # The extrinsics of the cameras start from the ground, and are changed to start from the
+        # frame ego.
         sample = sample_in_vehicle(
             "in memory", scene="", timestamp_ns=0, cameras=cameras, global_from_ground=None
         )

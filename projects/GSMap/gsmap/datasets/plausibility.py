@@ -9,10 +9,12 @@ from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.rigid import invert_rigid
 
 _MAX_DISTANCE_M = 20.0  # from the origin of the vehicle to a camera
-_MILLIMETRES_FROM = 300.0  # larger median distances are taken for millimetres, not centimetres
-_MIN_HEIGHT_M = 0.15  # camera above the road
+# Distances that are too large are taken for millimetres if their median is above this limit, and
+# otherwise for centimetres.
+_MILLIMETRES_FROM = 300.0
+_MIN_HEIGHT_M = 0.15  # height of a camera above the road
 _MAX_HEIGHT_M = 5.0
-_MAX_UP_DEG = 25.0  # slope of the optical axis
+_MAX_UP_DEG = 25.0  # slope of the optical axis, upwards and downwards
 _MAX_DOWN_DEG = 65.0
 _MAX_NAME_DEG = 110.0  # between the optical axis and the direction in the name of the camera
 # Distance of the principal point from the image centre, relative to the width or height.

@@ -80,7 +80,9 @@ _NOMINAL = {
 
 
 def usual_mount(frame: str, ground_z_m: float | None = None) -> np.ndarray:
-    """Return the transform from an annotation frame to the ground for a level sensor.
+    """Return the transform from an annotation frame at its usual place to the ground.
+
+    The sensor is assumed to be level.
 
     Args:
         frame: ``lidar``, a roof LiDAR mounted like in nuScenes, or ``ego``.
@@ -161,14 +163,14 @@ def change_frame(
 ) -> MapSample:
     """Transform the calibration of a sample to another annotation frame.
 
-    The new frame has the place in the vehicle that a model was trained with. If both frames are
-    ``lidar`` frames, the sample does not change: all roof LiDARs are treated as equal.
+    The new frame has the place in the vehicle that it had in the training data of a model. If both
+    frames are ``lidar`` frames, the sample does not change: all roof LiDARs are treated as equal.
 
     Args:
         sample: Sample.
         frame: Annotation frame of the sample, ``lidar`` or ``ego``.
-        wanted: Annotation frame of the result. A name, ``lidar`` or ``ego``, stands for a frame at
-            the usual place in the vehicle.
+        wanted: Annotation frame of the result. A name, ``lidar`` or ``ego``, selects the frame at
+            its usual place in the vehicle.
         ground_z_m: Height of the road in ``frame`` in metres; None for the usual height.
 
     Returns:
@@ -207,7 +209,10 @@ def _transform_cameras(
 
 
 def _transform_lidar(lidar: LidarRecord, new_from_frame: np.ndarray) -> LidarRecord:
-    """Return a LiDAR sweep, and its earlier ones, with transforms to a new frame. (4, 4)"""
+    """Return a LiDAR sweep whose transforms, and those in its list of sweeps, end in a new frame.
+
+    ``new_from_frame`` is the transform from the present frame to the new one. (4, 4)
+    """
     sweeps = []
     for sweep in lidar.sweeps:
         new_from_lidar = new_from_frame @ sweep.frame_from_lidar

@@ -31,7 +31,9 @@ def scenes_of(dataset: VectorizedMapDataset) -> list[list[int]]:
 
 
 class _Scene:
-    """Iterator over the samples of a scene, as single frames or as pieces in temporal order.
+    """Endless source of the samples of a scene, as single frames or as pieces of the scene.
+
+    A piece consists of consecutive samples in temporal order.
 
     Args:
         samples: Indices of the samples in temporal order.
@@ -58,7 +60,7 @@ class _Scene:
     def next_frames(self, in_pieces: bool) -> list[int]:
         """Return the next piece if ``in_pieces``, and otherwise the next single frame."""
         if in_pieces and self.has_singles and not self.finish_singles:
-            self.waiting.clear()
+            self.waiting.clear()  # drop the remaining single frames
         if not self.waiting:
             self.waiting = self._draw_pieces() if in_pieces else self._draw_single_frames()
             self.has_singles = not in_pieces
@@ -99,7 +101,7 @@ class StreamTrainSampler(Sampler[int]):
             the code that introduced this training. The scenes then switch at different times:
             after 1.6 times ``single_frame_iters`` iterations, half of the samples come from
             pieces.
-        seed: Seed of the random numbers, equal on all ranks. None is the same as 0.
+        seed: Seed of the random numbers, equal on all ranks. None means 0.
 
     Raises:
         TypeError: If the data set is not a `VectorizedMapDataset`.
@@ -146,15 +148,15 @@ class StreamTrainSampler(Sampler[int]):
 
     def batches(self) -> Iterator[list[int]]:
         """Yield the batches of this rank from the first iteration of training, without end."""
-        iterators = []
+        scenes = []
         for number, samples in enumerate(self.scenes):
             rng = np.random.default_rng([self.seed, self.rank, number])
-            iterator = _Scene(
+            scene = _Scene(
                 samples, rng=rng, num_pieces=self.pieces, finish_singles=self.late_switch
             )
-            iterators.append(iterator)
+            scenes.append(scene)
         first_stream = self.rank * self.slots
-        orders = []
+        orders = []  # for each stream of this rank: its scenes, and its samples that wait
         queues: list[deque[int]] = []
         for slot in range(self.slots):
             orders.append(self._scene_order(first_stream + slot))
@@ -164,7 +166,7 @@ class StreamTrainSampler(Sampler[int]):
             for queue, order in zip(queues, orders, strict=True):
                 if not queue:
                     number = next(order)
-                    queue.extend(iterators[number].next_frames(in_pieces))
+                    queue.extend(scenes[number].next_frames(in_pieces))
             yield [queue.popleft() for queue in queues]
 
     def _scene_order(self, stream: int) -> Iterator[int]:

@@ -28,23 +28,23 @@ _BROKEN_MODES = ("raise", "skip")
 _METAINFO_OF_FILE = (
     "classes", "x_range", "y_range", "dataset", "split", "frame", "ground_z_m", SPLIT_LIST,
 )  # fmt: skip
-_MAX_POSE_GAP_S = 5.0  # longest time between poses that vehicle signals are computed from
+_MAX_POSE_GAP_S = 5.0  # longest time between two poses for computing vehicle signals
 
 
 @DATASETS.register_module()
 class VectorizedMapDataset(BaseDataset):
     """Samples of a memory-mapped annotation file, with map elements as ground truth.
 
-    ``tools/create_data.py`` writes the annotation file. A file with another range, class list,
-    split or frame than expected is an error.
+    ``tools/create_data.py`` writes the annotation file. An error is raised if the range, classes,
+    split or frame of the file differ from the expected ones.
 
     Args:
         ann_file: Annotation file; relative to ``data_root`` unless absolute.
         data_root: Folder that image and LiDAR paths are relative to.
         pipeline: Transforms or their configs.
         classes: Expected class names of the file in label order; None for any.
-        grid: Arguments of `BEVGrid`. Its ``x_range`` and ``y_range`` in metres are the expected
-            ones of the file; None for any.
+        grid: Arguments of `BEVGrid`. The file is expected to have its ``x_range`` and ``y_range``
+            in metres; None for any.
         split: Expected split of the file; None for any.
         frame: Expected annotation frame of the file, ``lidar`` or ``ego``; None for any.
         dim: Coordinates per point of the ground truth, 2 or 3; None for the number in the file.
@@ -55,12 +55,12 @@ class VectorizedMapDataset(BaseDataset):
         cameras: Names of the cameras to use, in order; None for all cameras of each sample.
         test_mode: Whether to return all samples in order, with or without ground truth.
         filter_empty_gt: Whether to leave out samples without map elements in training.
-        shuffle_images_seed: Seed of an assignment of images to other samples, which measures how
-            well a model scores without matching images; None for the images of each sample.
+        shuffle_images_seed: Seed of a shuffle that gives each sample the images of another sample,
+            to measure the score of a model without matching images. None does not shuffle.
         signals_from_poses: Whether to compute missing vehicle signals (``can_bus``) from the poses
             of the drive; otherwise they are zero.
         pose_only_signals: Whether to replace the vehicle signals of all samples by signals that
-            are computed from the pose alone, like in MapTR's code for Argoverse 2
+            are computed from the pose alone, as in MapTR's code for Argoverse 2
             (`vehicle_signals.pose_only_signals`).
         ground_z_m: Height of the road in the frame in metres, for a file that does not have it. For
             other files it must agree with the file.
@@ -74,7 +74,7 @@ class VectorizedMapDataset(BaseDataset):
 
     Raises:
         FileNotFoundError: If there is no annotation file.
-        ValueError: If the file differs from an expected value, or an argument is out of its domain.
+        ValueError: If the file differs from an expected value, or an argument is not valid.
     """
 
     def __init__(
@@ -157,7 +157,8 @@ class VectorizedMapDataset(BaseDataset):
         """Open and check the annotation file, and list its rows.
 
         Returns:
-            ``row`` of each sample and ``image_row``, the row of the sample with its images.
+            For each sample, its ``row`` in the file and ``image_row``, the row of the sample whose
+            images it gets. Both are equal here; `filter_data` may change them.
         """
         self.annotations = AnnotationFile(self.ann_file)
         self.annotations.require(**self._expected)
@@ -321,8 +322,8 @@ class VectorizedMapDataset(BaseDataset):
             the form of mmdet3d's multi-view pipelines. ``map_instances`` has the elements at full
             resolution, with ``dim`` coordinates per point in metres. ``map_heights`` has the
             heights of the n points of each element in metres, (n,), or None for a file without
-            heights. Further keys are ``dim`` and the metainfo of the packed sample, in which
-            ``lidar`` is the annotation frame, as in mmdet3d: ``lidar2global``, for example.
+            heights. Further keys are ``dim`` and the metainfo of the packed sample. In names such
+            as ``lidar2global``, ``lidar`` is the annotation frame, as in mmdet3d.
 
         Raises:
             BrokenSampleError: If the sample lacks a camera of ``cameras``.

@@ -9,7 +9,7 @@ from mmengine.config import DictAction
 
 
 def data_root_options(data_root: str | Path) -> dict[str, str]:
-    """Return config overrides by dotted name, which set the data root of every split."""
+    """Return config overrides, by dotted name, that set the data root of every split."""
     splits = ("train", "val", "test")
     return {f"{split}_dataloader.dataset.data_root": str(data_root) for split in splits}
 
@@ -32,7 +32,7 @@ class _OptionAction(argparse.Action):
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that override config settings, parsed into ``cfg_options``."""
+    """Add the options that override config settings. The parser stores them in ``cfg_options``."""
     parser.add_argument(
         "--data-root",
         type=Path,

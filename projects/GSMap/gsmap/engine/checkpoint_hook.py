@@ -63,7 +63,7 @@ def _metainfo(loader: Any) -> dict[str, Any]:
 
 
 def _pass_model_facts(loop: Any, path: Path, meta: dict[str, Any]) -> None:
-    """Add the checkpoint's digest and calibration to the metadata that result files receive."""
+    """Add the checkpoint's digest and calibration to the metadata of the result files."""
     facts: dict[str, Any] = {CALIBRATION: calibration_of(meta)}
     if path.is_file():  # not an address
         facts[CHECKPOINT] = digest(path)
@@ -72,15 +72,16 @@ def _pass_model_facts(loop: Any, path: Path, meta: dict[str, Any]) -> None:
 
 @HOOKS.register_module()
 class AtomicCheckpointHook(CheckpointHook):
-    """mmengine's hook, for runs that may be killed and for checkpoints from untrusted sources.
+    """mmengine's checkpoint hook, made safe for killed runs and for untrusted checkpoints.
 
     A run that is killed during a save keeps its previous checkpoint, so ``--resume`` always finds a
-    complete one. A validation that was due when the run stopped is run first on resumption. A
-    checkpoint holds the settings of its model. Checkpoints are loaded with ``weights_only`` of
-    torch; when a run begins, the hook allows the classes that mmengine stores in a checkpoint.
+    complete one. A validation that was due when the run stopped is run first on resumption. Each
+    checkpoint contains the settings of its model. Checkpoints are loaded with torch's
+    ``weights_only``. When a run begins, the hook allows torch to load the classes that mmengine
+    stores in a checkpoint.
 
-    By default, validation and test data of another split than the training data raise
-    ``ValueError``, because the training may have covered the same places.
+    By default, validation or test data from another split than the training data raise
+    ``ValueError``, because the model may have been trained on the places that they show.
 
     Args:
         backend_args: Arguments of the file backend, by default atomic writes to local files.
@@ -112,10 +113,10 @@ class AtomicCheckpointHook(CheckpointHook):
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
         """Check a loaded checkpoint, and adapt it to the run in place.
 
-        The config text, which mmengine would execute, is removed. Weights from other training loops
-        are moved to ``state_dict``. On resumption, the optimizer state is converted to the
-        parameter groups of this run. The split and calibration of the checkpoint are passed to the
-        validation and test loops.
+        The config text, which mmengine would execute, is removed. Weights that other training loops
+        stored elsewhere are moved to ``state_dict``. On resumption, the optimizer state is
+        converted to the parameter groups of this run. The split of the checkpoint is passed to the
+        validation and test loops, and its calibration to the test loop.
 
         Raises:
             ValueError: If the run cannot be resumed from the checkpoint, or if the checkpoint was
@@ -177,9 +178,13 @@ class AtomicCheckpointHook(CheckpointHook):
         super()._save_checkpoint_with_step(runner, step=step, meta=meta)
 
     def _check_split(self, trained_meta: dict[str, Any], loop: Any) -> None:
-        """Require that training and evaluation data have one split, and pass it to the results.
+        """Require that evaluation data come from the training's split, and record it for results.
 
-        Data of another data set are not compared.
+        If the data sets differ, nothing is checked or recorded.
+
+        Args:
+            trained_meta: Metadata of the training's data set.
+            loop: Validation or test loop.
         """
         scored_meta = _metainfo(loop.dataloader)
         if trained_meta.get("dataset") != scored_meta.get("dataset"):
@@ -195,7 +200,7 @@ class AtomicCheckpointHook(CheckpointHook):
         loop.evaluator.dataset_meta = scored_meta | {TRAINED_ON: identity}
 
     def before_train(self, runner: Runner) -> None:
-        """Run a validation that was due when the run was interrupted, then start the training."""
+        """Prepare the training, and run a validation that was due when the run was interrupted."""
         super().before_train(runner)
         self._forget_foreign_best(runner)
         if isinstance(runner.val_loop, BaseLoop):

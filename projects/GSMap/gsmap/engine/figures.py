@@ -91,7 +91,7 @@ class LateHistory(HistoryBuffer):
 
 
 def _waiting_values(scalars: Mapping[str, HistoryBuffer]) -> _Waiting:
-    """Return the queue that the histories of a message hub share, or a new one at first."""
+    """Return the queue that the histories of a message hub share; a new queue if there is none."""
     for history in scalars.values():
         if isinstance(history, LateHistory):
             return history._waiting
@@ -101,8 +101,8 @@ def _waiting_values(scalars: Mapping[str, HistoryBuffer]) -> _Waiting:
 def keep_figures(hub: MessageHub, figures: Mapping[str, Any]) -> None:
     """Append the scalars of one iteration to the histories of a message hub.
 
-    Scalars on a GPU are not waited for. All of them are copied at once, on the next access to a
-    history.
+    The host does not wait for scalars on a GPU. All of them are copied at once, on the next access
+    to a history.
 
     Args:
         hub: Message hub of mmengine.
@@ -130,11 +130,11 @@ def keep_figures(hub: MessageHub, figures: Mapping[str, Any]) -> None:
 
 @HOOKS.register_module()
 class MapRuntimeInfoHook(RuntimeInfoHook):
-    """mmengine's hook without GPU synchronisation between log lines.
+    """mmengine's `RuntimeInfoHook`, without GPU synchronisation between log lines.
 
-    The model checks its losses (``loss_check``). On a GPU, a loss that is not finite ends the run
-    one iteration later. Losses that are still unchecked at the end of an epoch or of the training
-    are checked then.
+    The model checks that its losses are finite (``loss_check``). On a GPU, each check is one
+    iteration late. At the end of each epoch and of the training, the hook runs the checks that are
+    left.
     """
 
     def after_train_iter(
@@ -165,7 +165,7 @@ def finish_checks(runner: Runner) -> None:
     """Check the losses that a model has not checked yet.
 
     Raises:
-        FloatingPointError: If one is not finite.
+        FloatingPointError: If a loss is not finite.
     """
     model = runner.model.module if is_model_wrapper(runner.model) else runner.model
     if hasattr(model, "loss_check"):

@@ -5,7 +5,7 @@ from mmengine.hooks import Hook
 from mmengine.runner import Runner
 
 _SCALAR = "train/at_floor"
-_WINDOW = 50  # iterations that the share is averaged over
+_WINDOW = 50  # number of latest iterations over which the share is averaged
 _LARGEST_SHARE = 0.5
 
 
@@ -14,8 +14,8 @@ class GaussianHealthHook(Hook):
     """Warns after an epoch in which most Gaussians of matched predictions have the smallest size.
 
     GSMap's head logs ``at_floor``, the share of Gaussians whose two sigmas lie within 10 % of the
-    lower bound. The hook averages it over the latest 50 iterations and warns from a share of one
-    half. A model without Gaussians does not log it, and the hook does nothing.
+    lower bound. The hook averages this share over the latest 50 iterations, and warns if the mean
+    is at least one half. For a model that does not log the share, the hook does nothing.
     """
 
     def after_train_epoch(self, runner: Runner) -> None:

@@ -33,13 +33,13 @@ from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
 # Keys that configs copy into other sections; no code reads them at the top level
 _COPIED_KEYS = ("backend_args", "classes", "data_root", "grid", "vis_backends")
-# Top-level keys beside the runner's arguments; mmengine itself ignores a misspelt key
+# Valid top-level keys in addition to the runner's arguments; mmengine ignores a misspelt key
 _EXTRA_KEYS = (
     *_COPIED_KEYS, "custom_imports", "find_unused_parameters", "model_wrapper_cfg", "runner_type",
     "images_on_device", "strategy", "sync_bn",
 )  # fmt: skip
 _MAX_WORKERS = 16
-# Endings of the keys whose values must be dictionaries
+# Endings of the top-level keys whose values must be dictionaries
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
 _PART_LISTS = ("custom_hooks", "param_scheduler")  # keys whose values are parts or lists of parts
 
@@ -61,7 +61,8 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
 
     Args:
         config: File or name of a config (`find_config`), or a ``Config``, which is copied.
-        cfg_options: Overrides by dotted name; ``image_scale`` is the scale of all images.
+        cfg_options: Overrides by dotted name. The name ``image_scale`` sets the scale of all
+            images.
 
     Returns:
         The config, complete for building a runner or a model.
@@ -112,9 +113,9 @@ def _scale_images(cfg: Config, factor: float) -> None:
 def _fit_loaders(cfg: Config) -> None:
     """Adapt the data loaders of a config to the machine, in place.
 
-    ``num_workers='cores'`` becomes the number of cores per process, at most 16. With
-    ``images_on_device``, decoded images are copied to the device from pinned memory, and pixel
-    transforms run on the device.
+    The value ``"cores"`` of ``num_workers`` is replaced by the number of cores per process, at most
+    16. With ``images_on_device``, decoded images are copied to the device from pinned memory, and
+    pixel transforms run on the device.
 
     Raises:
         ValueError: If ``images_on_device`` is set and a transform reads the pixels on the host.
@@ -167,11 +168,13 @@ def load_config(args: argparse.Namespace) -> Config:
             cfg.pop(name)
     if args.launcher == "pytorch":
         # torchrun cannot stop its ranks if it is killed with SIGKILL, so each rank watches the
-        # launcher. The variable LAUNCHER names its process; by default it is the parent.
+        # launcher. The environment variable LAUNCHER contains the launcher's process id; by default
+        # the launcher is the parent process.
         launcher_process = int(os.environ.pop(LAUNCHER, os.getppid()))
         die_with_parent(launcher_process)
     if args.launcher == "pytorch" and not torch.cuda.is_available():
-        # mmengine would select a CUDA device, and pass its index to the wrapper of the model
+        # Without these settings, mmengine would select a CUDA device, and pass its index to the
+        # wrapper of the model.
         timeout = timedelta(seconds=rank_timeout_s(cfg))
         torch.distributed.init_process_group("gloo", timeout=timeout)
         cfg.model_wrapper_cfg = {
@@ -204,7 +207,8 @@ def newest_checkpoint(
 
     Args:
         work_dir: Folder of the run.
-        read: Function that raises ``ValueError`` if an undamaged checkpoint cannot be used.
+        read: Function that is called with the path of each undamaged checkpoint, and raises
+            ``ValueError`` if the checkpoint cannot be used.
 
     Returns:
         Path of the checkpoint, or None if there is no valid one.
@@ -214,7 +218,8 @@ def newest_checkpoint(
         match = re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name)
         if match:
             numbers[path] = int(match[1])
-    for path in sorted(numbers, key=numbers.__getitem__, reverse=True):  # the newest first
+    newest_first = sorted(numbers, key=numbers.__getitem__, reverse=True)
+    for path in newest_first:
         reason = f"{path} is damaged and is passed over."
         try:
             if _is_undamaged_zip(path):
@@ -255,7 +260,7 @@ def check_config(cfg: Config) -> None:
     _check_streams(cfg)
     _check_schedule(cfg)
     optimizer = (cfg.get("optim_wrapper") or {}).get("optimizer") or {}
-    # mmengine would build the run without an optimizer
+    # Without this check, mmengine would build a run without an optimizer.
     _check_registered(
         cfg, component="optimizer", registry=OPTIMIZERS, type_name=optimizer.get("type")
     )
@@ -264,7 +269,7 @@ def check_config(cfg: Config) -> None:
 
 
 def _check_lengths(cfg: Config) -> None:
-    """Require a training of one epoch or iteration at least, and valid settings of the loops.
+    """Require a training of at least one epoch or iteration, and valid settings of the loops.
 
     For 0 epochs, mmengine would train nothing and raise no error.
     """
@@ -297,7 +302,7 @@ def _check_backend(cfg: Config) -> None:
 
 
 def _check_schedule(cfg: Config) -> None:
-    """Require that a cosine schedule and the training end at one epoch."""
+    """Require that a cosine schedule and the training end at an equal epoch."""
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     if end is None:
         return
@@ -329,7 +334,7 @@ def _check_registered(cfg: Config, component: str, registry: Registry, type_name
 
 
 def _check_effect(cfg: Config, name: str) -> None:
-    """Refuse an override of a template value, because other settings already hold copies of it."""
+    """Refuse an override of a template value, because the settings in use are copies of it."""
     top, *keys = name.split(".")
     if not (top.startswith("_") or top in _COPIED_KEYS):
         return
@@ -354,7 +359,7 @@ def _check_effect(cfg: Config, name: str) -> None:
 
 
 def _find_copies(settings: Any, key: str, value: Any, prefix: str) -> Iterator[str]:
-    """Yield the dotted names of the settings that have a key and a value.
+    """Yield the dotted names of the settings that have a given key and value.
 
     Args:
         settings: Nested dictionaries and lists.

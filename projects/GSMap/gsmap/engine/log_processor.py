@@ -9,8 +9,8 @@ from mmengine.runner import LogProcessor, Runner
 # Items that are removed from lines of iterations: losses of the layers before the last, statistics
 # of the Gaussians, and the time of data loading.
 _MINOR = re.compile(r"d\d+\.|data_time:|at_floor:|[\w.]+/[\w.]+:")
-# Items that are removed from lines of evaluations: all metrics of MapMetric except for the APs of
-# classes and groups and the means of APs.
+# Items that are removed from lines of evaluations: all metrics of MapMetric, except for the AP of
+# each class and group and the mean APs.
 _DETAIL = re.compile(r"(.*/)?(chamfer|raster)/(?!.*\bm?AP:)")
 
 
@@ -18,8 +18,8 @@ _DETAIL = re.compile(r"(.*/)?(chamfer|raster)/(?!.*\bm?AP:)")
 class MapLogProcessor(LogProcessor):
     """mmengine's log processor with log lines that name only the main metrics.
 
-    `MapMetric` computes some 180 metrics and logs its tables itself. Backends such as TensorBoard,
-    JSON logs and ``tools/test.py --metrics-out`` receive all of them.
+    `MapMetric` computes about 180 metrics and logs its tables itself. TensorBoard and other
+    backends, JSON logs and ``tools/test.py --metrics-out`` receive all metrics.
     """
 
     def get_log_after_iter(
@@ -60,7 +60,7 @@ class MapLogProcessor(LogProcessor):
 
 def _remove_items(line: str, pattern: re.Pattern[str]) -> str:
     """Remove the items of a log line that match a pattern."""
-    # mmengine writes the progress in brackets, then the items. Two blanks separate all of them.
+    # mmengine writes the progress in brackets, then the items, all separated by two blanks.
     head, _, rest = line.partition("]  ")
     parts = [f"{head}]"]
     for item in rest.split("  "):

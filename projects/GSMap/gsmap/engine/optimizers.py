@@ -33,7 +33,8 @@ class _LateNorm(OptimWrapper):
         model_indices: list[int] = []
         for indices in self.members:
             model_indices.extend(indices)
-        if model_indices:  # sum the norms in the order of the model, whatever the groups are
+        if model_indices:
+            # Sum the norms in the order of the model, so that rounding does not depend on groups.
             pairs = sorted(zip(model_indices, params, strict=True), key=itemgetter(0))
             params = [param for _, param in pairs]
         params = [p for p in params if p.requires_grad and p.grad is not None]
@@ -154,9 +155,9 @@ def _group_settings(group: dict[str, Any]) -> dict[str, Any]:
 def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
     """Convert the optimizer and scheduler states of a checkpoint to merged groups, in place.
 
-    The checkpoint may hold one group per parameter, as mmengine's constructor makes them. It may
-    also have been written on another kind of device, so the choice of kernels (fused, foreach)
-    comes from the optimizer of this run.
+    The checkpoint may have one group per parameter, as mmengine's constructor makes them. It may
+    also come from a run on another kind of device. Therefore the choice of kernels (fused, foreach)
+    is copied from the optimizer of this run.
 
     Args:
         checkpoint: Checkpoint of a training, possibly without an optimizer.
@@ -175,7 +176,7 @@ def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
     has_group_per_param = group_sizes == [1] * param_count
     if len(groups) > len(members) and has_group_per_param:
         _merge_state(state, members=members)
-        # mmengine may append a group with its base settings, after all others.
+        # mmengine may append a group with the optimizer's base settings after all other groups.
         extra_groups = len(wrapper.param_groups) - len(members)
         if not extra_groups:
             state.pop("base_param_settings", None)

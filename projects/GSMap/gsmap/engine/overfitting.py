@@ -1,10 +1,10 @@
-"""Training on a few samples until a model reproduces them, the first test of a new data set."""
+"""Training on a few samples until a model reproduces them, as a first test of a new data set."""
 
 from mmengine.config import Config
 
 from gsmap.utils.errors import InputError
 
-LOG_LINES = 10  # loss lines of a run
+LOG_LINES = 10  # number of times that a run logs its losses
 WARM_UP = 20  # iterations
 
 

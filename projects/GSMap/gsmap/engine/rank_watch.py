@@ -1,4 +1,4 @@
-"""Detection of a rank that no longer answers; it ends the run with an error that names the rank."""
+"""Detection of ranks that no longer answer. The run then ends with an error that names them."""
 
 import os
 import platform
@@ -15,7 +15,7 @@ from gsmap.utils.cli import BAD_INPUT
 
 TIMEOUT_S = 1800.0  # default of env_cfg.dist_cfg.timeout
 _PATIENCE = 0.8  # share of the timeout after which a rank without progress checks all ranks
-_MISSED_BEATS = 3  # heartbeats after which a rank counts as silent
+_MISSED_BEATS = 3  # number of missed heartbeats after which a rank counts as silent
 
 
 class _Report(NamedTuple):
@@ -36,9 +36,10 @@ class RankWatch:
     """Context manager that watches the ranks of a run from a background thread in each rank.
 
     Every rank writes a heartbeat and its number of steps to the distributed store of the run. A
-    rank that has made no step for most of the timeout reads the heartbeats of all ranks. If ranks
-    are silent, or else if ranks are behind the others, it names them and ends its process. This
-    comes before the pending collective operation times out with an error that names no rank.
+    rank that has made no step for most of the timeout reads the heartbeats of all ranks. It prints
+    which ranks are silent or, if all ranks answer, which ranks have made the fewest steps. Then it
+    ends its process. This happens before the pending collective operation times out, whose error
+    names no rank.
 
     Args:
         timeout_s: Time that a collective operation may take, in seconds.
@@ -59,7 +60,7 @@ class RankWatch:
         port = int(os.environ["MASTER_PORT"])
         answer_timeout = timedelta(seconds=self._beat_s)
         store = dist.TCPStore(host, port, is_master=False, timeout=answer_timeout)
-        # After a restart by torchrun, heartbeats from before the restart are not read.
+        # The prefix keeps heartbeats from before a restart by torchrun from being read.
         restart_count = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
         self._store = dist.PrefixStore(f"gsmap/{restart_count}", store)
         self.step("its start")
@@ -71,13 +72,13 @@ class RankWatch:
         self._thread.join()
 
     def step(self, name: str) -> None:
-        """Record that this rank begins a step of this name."""
+        """Record that this rank begins a step, such as a call of a hook, with the given name."""
         self._step_start_s = time.monotonic()
         self._steps += 1
         self._name = name
 
     def _watch(self) -> None:
-        self._beat()  # a rank may hang before the first wait ends
+        self._beat()  # at once, because a rank may hang before the first wait ends
         while not self._ended.wait(self._beat_s):
             self._beat()
             if time.monotonic() - self._step_start_s > _PATIENCE * self._timeout_s:
@@ -87,14 +88,15 @@ class RankWatch:
         """Write the heartbeat, the number of steps and the process of this rank to the store."""
         self._beats += 1
         description = f"process {os.getpid()} on {platform.node()}, at {self._name}"
-        with suppress(RuntimeError):  # the store does not answer: `_end_if_stuck` reports it
+        # An error means that the store does not answer, which `_end_if_stuck` reports.
+        with suppress(RuntimeError):
             self._store.set(f"{self._rank}", f"{self._beats} {self._steps} {description}")
 
     def _read_reports(self) -> dict[int, _Report]:
         """Return the latest heartbeat of each rank.
 
-        If the store does not answer for this rank, the result holds rank 0 alone, whose machine
-        runs the store.
+        If the store does not answer, the result contains only rank 0, because the store runs on the
+        machine of rank 0.
         """
         reports: dict[int, _Report] = {}
         for rank in (self._rank, *range(self._ranks)):  # first this rank, as a test of the store
@@ -111,7 +113,7 @@ class RankWatch:
         return reports
 
     def _end_if_stuck(self) -> None:
-        """End this process if it still makes no step, and name the ranks that it waits for."""
+        """Name the ranks that this rank waits for and end its process, if it is still stuck."""
         steps = self._steps
         before = self._read_reports()
         for _ in range(_MISSED_BEATS):

@@ -30,7 +30,7 @@ def refusal(path: object, reason: str) -> ValueError:
 
 @contextmanager
 def refusing_state(path: object) -> Iterator[None]:
-    """Context that turns exceptions of a state that does not fit into a one-line error.
+    """Context manager that replaces the exceptions of a malformed state by a one-line error.
 
     Args:
         path: File of the checkpoint, for the error.
@@ -46,7 +46,7 @@ def refusing_state(path: object) -> Iterator[None]:
 
 
 def check_resumable(checkpoint: Mapping[str, Any], runner: Runner, path: object) -> None:
-    """Require a checkpoint that mmengine can resume from without errors or wrong state.
+    """Require a checkpoint from which mmengine can resume without errors and with a valid state.
 
     Args:
         checkpoint: Content of the checkpoint.
@@ -54,7 +54,7 @@ def check_resumable(checkpoint: Mapping[str, Any], runner: Runner, path: object)
         path: File of the checkpoint, for the error.
 
     Raises:
-        ValueError: If a part is missing or malformed, or if the checkpoint is from a later
+        ValueError: If a part is missing or malformed, or if the checkpoint is from a later epoch or
             iteration than the end of this training.
     """
     missing = [part for part in _PARTS if not isinstance(checkpoint.get(part), Mapping)]
@@ -84,11 +84,12 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
         ValueError: If a setting has another type than in the run, or if an entry is not finite,
             or has neither a single value nor the shape of its parameter.
     """
-    # If the numbers of groups or parameters differ, torch refuses the state when it loads it.
+    # `zip` is not strict: torch itself refuses a state with other numbers of groups or parameters.
     for group, run_group in zip(state["param_groups"], optimizer.param_groups, strict=False):
         for name in run_group.keys() & group.keys() - {"params"}:
             if not _is_compatible(group[name], reference=run_group[name]):
                 raise refusal(path, reason=f"its optimizer has {name} = {group[name]!r:.40}")
+    # The state refers to parameters by number, in the order of the groups.
     numbers = chain.from_iterable(group["params"] for group in state["param_groups"])
     parameters = chain.from_iterable(group["params"] for group in optimizer.param_groups)
     for number, parameter in zip(numbers, parameters, strict=False):
@@ -102,7 +103,7 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
 
 
 def _fits(value: Any, parameter: Tensor) -> bool:
-    """Whether an optimizer can hold this value as an entry of its state for a parameter."""
+    """Whether a value is a plausible entry of an optimizer's state for a parameter."""
     if isinstance(value, Tensor):
         return value.shape in ((), parameter.shape) and bool(value.isfinite().all())
     return value is None or _is_number(value)
@@ -116,9 +117,9 @@ def _is_number(value: Any) -> bool:
 def _is_compatible(value: Any, reference: Any) -> bool:
     """Whether a value can replace a reference value of an optimizer.
 
-    A finite number can replace a number. A list can replace a list of equal length if each of its
-    entries can replace the entry at that position. None, a text, a number or a tensor can replace
-    None. Other values must have the type of the reference.
+    A finite number can replace a number. A list can replace a list of equal length if each entry
+    can replace the reference's entry at its position. None, a text, a number or a tensor can
+    replace None. All other values must have the type of the reference.
     """
     if isinstance(reference, list | tuple):
         if not isinstance(value, list | tuple) or len(value) != len(reference):

@@ -25,7 +25,7 @@ from gsmap.utils.errors import NotFiniteError
 from gsmap.utils.files import add_path_to_errors, write_text
 from gsmap.utils.words import format_count
 
-# Prefixes of mmengine's long log records and of records without information about the run
+# Beginnings of mmengine's long log records, and of its records that do not concern the run.
 _DUMPS = (
     "\n" + "-" * 60 + "\nSystem environment", "Config:\n", "Hooks will be executed", "Exp name: ",
     '"FileClient" will be', '"HardDiskBackend" is the alias', "Distributed training is not used",
@@ -33,7 +33,7 @@ _DUMPS = (
 
 
 def _lower_dumps(record: logging.LogRecord) -> bool:
-    """Set the level of mmengine's long records to ``DEBUG``; a filter that keeps all records."""
+    """Set the level of mmengine's long records to ``DEBUG``. As a log filter, keep all records."""
     if record.getMessage().startswith(_DUMPS):
         record.levelno = logging.DEBUG
         record.levelname = "DEBUG"
@@ -121,7 +121,7 @@ class MapRunner(Runner):
             )
 
     def call_hook(self, fn_name: str, **kwargs: Any) -> None:
-        """Call a method of all hooks, and report a step to `RankWatch`."""
+        """Call a method of all hooks, and record in `RankWatch` that this rank begins a step."""
         if self._watch:
             self._watch.step(f"{fn_name}, iteration {self.iter}")
         super().call_hook(fn_name, **kwargs)
@@ -137,7 +137,10 @@ class MapRunner(Runner):
 
 
 def _divergence_advice(runner: Runner) -> str:
-    """Return advice after a divergence: a new run, since ``--resume`` keeps the learning rate."""
+    """Return advice to start a new run after a divergence with a lower learning rate.
+
+    ``--resume`` would keep the learning rate.
+    """
     checkpoint = newest_checkpoint(runner.work_dir)
     if checkpoint:
         start = "from its last good checkpoint"
@@ -220,8 +223,7 @@ def _describe_data(runner: Runner) -> dict[str, str]:
         dataset = innermost(loader.dataset)
         file = getattr(dataset, "ann_file", type(dataset).__name__)
         lines[name] = f"{format_count(len(loader.dataset), noun='sample')} of {file}"
-    # `dataset` is now the validation set, or the training set without validation. Cameras and map
-    # are equal in both.
+    # `dataset` is now the last one of the loop. The cameras and the map are equal in all of them.
     if not hasattr(dataset, "sample"):
         return lines
     cameras = dataset.sample(0).cameras

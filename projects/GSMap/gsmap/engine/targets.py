@@ -1,4 +1,4 @@
-"""Training targets of a config: transforms that compute them, and settings shared with the head."""
+"""Training targets of a config: their transforms, and the settings shared with the head."""
 
 import inspect
 from collections.abc import Iterator
@@ -16,8 +16,8 @@ from gsmap.utils.targets import NeedsTargets
 def share_settings(cfg: Config) -> None:
     """Copy settings of the head to the transforms that compute its targets, in place.
 
-    The settings to copy come from `NeedsTargets.target_settings`. A transform keeps a value that
-    the config gives explicitly; `check_targets` compares it with the head.
+    `NeedsTargets.target_settings` returns the settings to copy. A value that the config gives to a
+    transform explicitly is kept; `check_targets` compares it with the head.
 
     Args:
         cfg: Config to change.
@@ -27,7 +27,8 @@ def share_settings(cfg: Config) -> None:
         head_settings = _target_settings(head)
         if not head_settings:
             continue
-        for step in _find_steps(sections, names=_class_with_targets(head.get("type")).transforms):
+        transform_names = _class_with_targets(head.get("type")).transforms
+        for step in _find_steps(sections, names=transform_names):
             transform = class_of_type(step["type"], registry=TRANSFORMS)
             parameters = _defaults(transform)
             for name, value in head_settings.items():
@@ -36,10 +37,11 @@ def share_settings(cfg: Config) -> None:
 
 
 def _check_agreement(cfg: Config, steps: list[Any]) -> None:
-    """Require transforms with the values that follow from the settings of the head."""
+    """Raise ValueError if a setting of a transform contradicts the settings of the head."""
     for head in _heads(cfg):
         head_settings = _target_settings(head)
-        for step in _find_steps(steps, names=_class_with_targets(head.get("type")).transforms):
+        transform_names = _class_with_targets(head.get("type")).transforms
+        for step in _find_steps(steps, names=transform_names):
             for name in head_settings.keys() & step.keys():
                 if _tuples_to_lists(step[name]) != _tuples_to_lists(head_settings[name]):
                     raise InputError(
@@ -51,8 +53,8 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
 
 def _target_settings(head: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of transforms that follow from the config of a head."""
-    # Typed as Any: `_defaults` is cached and so needs a hashable argument, and mypy does not know
-    # that the class of a protocol is hashable.
+    # Typed as Any, because the cached function `_defaults` needs a hashable argument, and mypy does
+    # not accept the class of a protocol as hashable.
     head_class: Any = _class_with_targets(head.get("type"))
     try:
         return head_class.target_settings({**_defaults(head_class), **head})
@@ -118,8 +120,7 @@ def needed_targets(cfg: Config) -> dict[str, Any]:
     """Return the transforms that compute the targets of a config's head and its parts.
 
     Returns:
-        The type of the head, loss or auxiliary head that needs a transform, by the transform's
-        name.
+        For each transform, by its name, the type of the head, loss or auxiliary head that needs it.
     """
     heads = _heads(cfg)
     parts: list[Any] = list(heads)
@@ -139,7 +140,7 @@ def needed_targets(cfg: Config) -> dict[str, Any]:
 def _class_with_targets(kind: Any) -> type[NeedsTargets]:
     """Return the class of a part if it inherits from `NeedsTargets`, otherwise `NeedsTargets`.
 
-    The base class `NeedsTargets` itself names no transforms and has no target settings.
+    The base class `NeedsTargets` itself has no transforms and no target settings.
     """
     part_class = class_of_type(kind)
     if part_class is not None and issubclass(part_class, NeedsTargets):
@@ -148,7 +149,7 @@ def _class_with_targets(kind: Any) -> type[NeedsTargets]:
 
 
 def class_of_type(kind: Any, registry: Registry = MODELS) -> type | None:
-    """Return the class that a ``type`` of a config names; None if there is no such class.
+    """Return the class of the ``type`` in a config, or None if there is no such class.
 
     Args:
         kind: Class, or name of a class.
@@ -159,7 +160,7 @@ def class_of_type(kind: Any, registry: Registry = MODELS) -> type | None:
 
 
 def check_targets(cfg: Config) -> None:
-    """Require a training pipeline with the transforms that `needed_targets` names.
+    """Check that the training pipeline has the transforms of `needed_targets`.
 
     Raises:
         ValueError: If a transform is missing, or its settings contradict the head.

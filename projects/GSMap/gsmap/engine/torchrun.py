@@ -1,6 +1,7 @@
-"""torchrun that ends with a one-line error: ``python -m gsmap.engine.torchrun``.
+"""torchrun that reports failures in a one-line error: ``python -m gsmap.engine.torchrun``.
 
-The ranks report Ctrl-C themselves. A rank that dies for any reason ends the others.
+A rank is one of the processes that torchrun starts. Rank 0 reports Ctrl-C itself. If a rank dies
+for any reason, torchrun stops the others.
 """
 
 import logging
@@ -11,7 +12,8 @@ import sys
 from gsmap.utils.interrupt import leave_at_once_on_ctrl_c
 
 if __name__ == "__main__":
-    # For Ctrl-C during the import of torch, which takes seconds. Later torchrun sets its handler.
+    # The import of torch takes seconds, during which Ctrl-C must end the process at once. Later,
+    # torchrun sets its handler.
     leave_at_once_on_ctrl_c()
 # isort: split
 from torch.distributed.elastic.multiprocessing import SignalException
@@ -28,16 +30,17 @@ STOP_TIMEOUT_S = 30  # torchrun ends ranks with SIGTERM, and after this time wit
 def _cause(error: ChildFailedError) -> tuple[int, ProcessFailure]:
     """Return the rank whose failure caused the failures of the others, and this failure.
 
-    torch lists the ranks that it stops itself among the failures, and records times in whole
-    seconds. Failures are therefore ordered by kind first: killed ranks, interrupted ranks, then
-    ranks that ended with an error, because a rank that loses its peers ends with an error.
+    The list of failures also contains the ranks that torchrun stopped, and its times are in whole
+    seconds. Failures are therefore ordered by kind first, and by time within a kind. Killed ranks
+    are first, then interrupted ranks, then ranks that ended with an error, because a rank that
+    loses its peers ends with an error.
     """
     first_s = min(failure.timestamp for failure in error.failures.values())
 
     def order(rank: int) -> tuple[bool, bool, bool, float, int]:
         failure = error.failures[rank]
         code = failure.exitcode
-        # Times are in whole seconds, so the limit has a tolerance of one second.
+        # Whole seconds need a tolerance of one second.
         is_late = failure.timestamp - first_s >= STOP_TIMEOUT_S - 1
         was_killed_late = code == -signal.SIGKILL and is_late
         stopped_by_torchrun = code == -signal.SIGTERM or was_killed_late
@@ -54,8 +57,8 @@ def _cause(error: ChildFailedError) -> tuple[int, ProcessFailure]:
 def signal_behind(error: BaseException | None) -> SignalException | None:
     """Return the signal that led to an exception, or None.
 
-    torchrun turns a signal into an exception at an arbitrary point, and the interrupted code may
-    raise another exception while it handles this one.
+    torchrun raises an exception for a signal at an arbitrary point of the code. The interrupted
+    code may raise another exception while it handles this one.
     """
     while error is not None and not isinstance(error, SignalException):
         error = error.__cause__ or error.__context__

@@ -20,17 +20,17 @@ from gsmap.structures.grid import BEVGrid
 
 Array = npt.NDArray[Any]
 
-SCORE_THRESHOLD = 0.3
-PIXEL_M = 0.3
+SCORE_THRESHOLD = 0.3  # smallest score of a prediction that counts
+PIXEL_M = 0.3  # size of a pixel of the masks
 LINE_WIDTH_M = 0.75  # width of a ground-truth line in its mask
 
 
 @METRICS.register_module()
 class GaussianMetric(BaseMetric):
-    """Soft IoU of the masks of predictions and ground truths, and the sizes of the Gaussians.
+    """Metric of the soft IoU of predicted and true masks, and of the sizes of the Gaussians.
 
-    Predictions of a class are assigned to its ground truths by the soft IoU of their masks.
-    Predictions with a score of 0.3 or more count. A model without Gaussians has no figures.
+    Predictions of a class are assigned to its ground truths by the soft IoU of their masks. Only
+    predictions with a score of 0.3 or more count. A model without Gaussians has no figures.
     """
 
     default_prefix = "gaussians"
@@ -41,8 +41,8 @@ class GaussianMetric(BaseMetric):
         Args:
             data_batch: Not used.
             data_samples: Samples with ``token``, ``x_range`` and ``y_range`` in metres,
-                ``eval_ann_info`` and ``pred_instances_3d`` (docs/architecture.md), the latter with
-                ``min_scale_m``.
+                ``eval_ann_info`` and ``pred_instances_3d`` (docs/architecture.md).
+                ``pred_instances_3d`` contains ``min_scale_m``, the lower bound of sizes in metres.
         """
         for sample in data_samples:
             has_gaussians = "scales" in sample["pred_instances_3d"]
@@ -55,10 +55,10 @@ class GaussianMetric(BaseMetric):
         """Measure the Gaussians of one sample.
 
         Returns:
-            Tuple of two entries. First, whether each Gaussian of the sample is at the lower bound
-            of sizes. (n,) Second, a dictionary by label. Its values are pairs of arrays: the soft
-            IoU of each matched pair of the class (m,), and the sizes of each Gaussian of the class
-            in metres, along and across the line (k, 2).
+            Whether each Gaussian of the sample is at the lower bound of sizes (n,), and a dict by
+            label. Its values are two arrays: the soft IoU of each matched pair of the class
+            (m,), and the sizes in metres of each Gaussian of the class, along and across the line
+            (k, 2).
         """
         predictions = sample["pred_instances_3d"]
         truth = sample["eval_ann_info"]
@@ -79,7 +79,7 @@ class GaussianMetric(BaseMetric):
             iou = self._matched_iou(masks[is_class], lines=lines, grid=grid)
             sizes = extents[is_class].flatten(start_dim=0, end_dim=1).numpy()
             figures[label] = (iou, sizes)
-        # AT_FLOOR is a factor slightly above 1, as sizes only approach their lower bound.
+        # AT_FLOOR is a factor slightly above 1, as sizes approach their lower bound but stay above.
         at_floor = (scales < AT_FLOOR * predictions["min_scale_m"]).all(dim=-1)
         return at_floor.flatten().numpy(), figures
 
@@ -102,7 +102,7 @@ class GaussianMetric(BaseMetric):
         return iou[pred_index, gt_index]
 
     def compute_metrics(self, results: list[tuple[str, Any]]) -> dict[str, float]:
-        """Average over all samples and log a table.
+        """Compute the figures of all samples and log them as a table.
 
         Args:
             results: Token and measurement of each sample.

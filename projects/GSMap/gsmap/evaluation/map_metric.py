@@ -135,7 +135,8 @@ class MapMetric(BaseMetric):
         Returns:
             Figures by their flat keys.
         """
-        # Samples that fill the last batch of a rank are repetitions: the first record counts.
+        # A sampler repeats samples to fill the last batch of a rank. The first record of a sample
+        # counts: in reversed order, it is the last one to be written to the dict.
         unique = {record["token"]: record for record in reversed(results)}
         records = [unique[token] for token in sorted(unique)]
         if len(records) != self._size:

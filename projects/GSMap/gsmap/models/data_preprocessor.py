@@ -18,8 +18,8 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
     """`Det3DDataPreprocessor` of mmdet3d for samples of several cameras.
 
     It has the arguments and results of the base class. All tensors of a batch are copied to a GPU
-    without synchronisation, and small ones as one block of memory. Images of equal size are
-    converted, normalised and padded as one tensor.
+    without synchronisation, and the small tensors are copied as one block of memory. Images of
+    equal size are converted, normalised and padded as one tensor.
     """
 
     def cast_data(self, data: Any) -> Any:
@@ -57,8 +57,8 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             samples: The samples, with the steps in their metainfo.
 
         Returns:
-            Images after all steps, as the pipelines of the published systems pack them. These
-            pipelines run the steps on the CPU. (B, V, 3, H', W')
+            Images after all steps. The pipelines of the published systems run these steps on the
+            CPU instead, and pack such images. (B, V, 3, H', W')
         """
         steps = [sample.metainfo.get("image_steps") or () for sample in samples]
         return run_image_steps(images, steps)
@@ -108,11 +108,11 @@ def run_image_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
 
 
 def _join_steps(steps: Sequence[Sequence[Any]]) -> list[Any] | None:
-    """Join the steps of all samples to steps of the batch.
+    """Join the steps of all samples to steps of the whole batch.
 
     Returns:
-        Steps of the batch, one for each position in the lists of the samples. None if the samples
-        differ in the number of steps, or in the kind of the step at a position.
+        Steps of the batch, one for each position in the samples' lists of steps. None if the
+        samples differ in the number of steps, or in the kind of step at a position.
     """
     num_steps = len(steps[0])
     for sample_steps in steps:
@@ -144,7 +144,7 @@ def _have_one_size(images: Any) -> bool:
 
 
 def _collect_tensors(data: Any) -> list[Tensor]:
-    """All tensors in nested data."""
+    """List all tensors in nested data."""
     tensors: list[Tensor] = []
     if isinstance(data, Tensor):
         tensors.append(data)
@@ -158,7 +158,7 @@ def _collect_tensors(data: Any) -> list[Tensor]:
 
 
 def _replace_tensors(data: Any, replacements: Mapping[int, Tensor]) -> Any:
-    """Copy nested data, with each tensor replaced by the one for its ``id``."""
+    """Copy nested data, and replace each tensor by the entry of ``replacements`` for its ``id``."""
     if isinstance(data, Tensor):
         return replacements[id(data)]
     if isinstance(data, BaseDataElement | Mapping):

@@ -35,12 +35,12 @@ Samples = Sequence[Det3DDataSample]
 class MapDetector(Base3DDetector):
     """Detector of map elements: image backbone and neck, BEV encoder and head.
 
-    A model with LiDAR also has a LiDAR encoder, and with both sensors a fusion of their BEV
-    features. Modules are given as configs, or as None if the model does not have them.
+    A model with LiDAR also has a LiDAR encoder. A model with both sensors also has a fusion of
+    their BEV features. Modules are given as configs, or as None if the model does not have them.
 
     Args:
-        grid: Extent of the map: ``x_range`` and ``y_range`` in metres, optionally ``forward``.
-            Encoders, head, masks and coder receive it.
+        grid: Extent of the map, as arguments of `BEVGrid`: ``x_range`` and ``y_range`` in metres,
+            and optionally ``forward``. The grid is passed on to the encoders and the head.
         classes: Names of the classes.
         map_head: Head.
         bev_encoder: BEV encoder of the cameras.
@@ -55,25 +55,29 @@ class MapDetector(Base3DDetector):
         fold_batch_norms: In inference, run a copy of the image backbone whose batch norms are
             folded into its convolutions. This is faster, but the copy has its weights in memory a
             second time.
-        allow_untrained: Accept checkpoints without the weights of modules that start without
-            effect, for example the Gaussians of GSMap in a checkpoint of MapTR. Trainings accept
-            them, all other commands only on request. All other weights must be present, with the
-            names of this package or of the published model, and there must be no further ones.
+        allow_untrained: Accept checkpoints that lack the weights of modules that initially have no
+            effect. For example, a checkpoint of MapTR lacks the Gaussians of GSMap. Trainings
+            accept such checkpoints, all other commands only on request. All other weights must be
+            present, with the names of this package or of the published model. Further weights are
+            not allowed.
         autocast: With ``"bfloat16"``, backbone, neck and encoders, which do nearly all of the
             arithmetic, use this type in training. Head, matching and losses run in float32, and no
             loss scale is needed. A ResNet with fixed batch norms is computed as fused convolutions
-            (`FrozenNorms`). With None, the detector does not use autocast; ``--amp`` then runs it
-            with the head included.
+            (`FrozenNorms`). With None, the detector itself does not use autocast. The option
+            ``--amp`` then applies autocast to the whole model, including the head.
         compiled: Compile backbone, neck, encoders and head at the start of a training, which takes
             a minute or more. True, or a mode of ``torch.compile``; ``"reduce-overhead"`` also
             captures CUDA graphs.
-        cuda_graphs: Record the operations of a training step up to the predictions once, on a GPU,
-            and replay them, forward and backward (`StepGraphs`). With ``autocast``, matrix products
-            of float32 tensors among these operations are computed in TF32.
+        cuda_graphs: On a GPU, record the operations of a training step up to the predictions once,
+            and replay them in every step, forward and backward (`StepGraphs`). With ``autocast``,
+            matrix products of float32 tensors among these operations are computed in TF32.
+        data_preprocessor: Config of the data preprocessor.
+        init_cfg: Initialisation config of mmengine.
 
     Raises:
-        ValueError: If there is no encoder, two encoders without a fusion, another ``autocast``, or
-            ``cuda_graphs`` for a model whose steps cannot be recorded.
+        ValueError: If there is no encoder, if there is no fusion for two encoders or a fusion for
+            one, if ``autocast`` has another value, or if ``cuda_graphs`` is set for a model whose
+            steps cannot be recorded.
     """
 
     compiler: ClassVar[str] = "inductor"  # backend of torch.compile
@@ -103,8 +107,9 @@ class MapDetector(Base3DDetector):
         self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
         self.folded_backbone = FoldedBackbone() if fold_batch_norms else None
         self.frozen_norms = FrozenNorms()
-        # Convolutions on CPUs and tensor cores are fastest with channels last. mmcv's deformable
-        # convolution reads such tensors as channels first, without an error.
+        # Convolutions on CPUs and tensor cores are fastest with channels last. A backbone with
+        # mmcv's deformable convolution cannot use this format: the convolution would read the
+        # tensors as channels first, without an error.
         self.channels_last = True
         if self.img_backbone is not None:
             for module in self.img_backbone.modules():
@@ -140,7 +145,7 @@ class MapDetector(Base3DDetector):
             self.step_graphs = StepGraphs()
 
     def train(self, mode: bool = True) -> "MapDetector":
-        """Set the mode. If ``compiled`` is set, the modules are compiled before a training."""
+        """Set the mode. If ``compiled`` is set, the first call with True compiles the modules."""
         super().train(mode)
         if mode and self.compiled:
             compile_mode = None if self.compiled is True else self.compiled
@@ -199,14 +204,14 @@ class MapDetector(Base3DDetector):
         self.half_backbone = HalfBackbone()
 
     def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Any]:
-        """Outputs of the BEV encoder: ``bev_feats`` (B, C, H, W), and inputs of encoder losses."""
+        """Run the encoders. Returns ``bev_feats`` (B, C, H, W), and inputs of encoder losses."""
         with self._training_autocast() as in_half_precision:
             outputs = self._encode(batch_inputs, batch_data_samples)
         return tree_map_only(Tensor, _in_float32, outputs) if in_half_precision else outputs
 
     @contextmanager
     def _training_autocast(self) -> Iterator[bool]:
-        """Context manager of ``autocast`` in training; yields whether it is in effect."""
+        """Context manager that applies ``autocast`` in training; yields whether it is active."""
         if not (self.training and self.autocast):
             yield False
             return
@@ -217,7 +222,7 @@ class MapDetector(Base3DDetector):
             yield True
 
     def _encode(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Outputs of the BEV encoder, in the types of the autocast context."""
+        """Run the encoders. The types of the outputs are not converted after autocast."""
         outputs: dict[str, Tensor] = {}
         if self.bev_encoder is not None:
             imgs = self.augment_images(batch_inputs["imgs"])
@@ -235,11 +240,14 @@ class MapDetector(Base3DDetector):
         return outputs
 
     def encode_images(self, imgs: Tensor, calibration: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Outputs of the BEV encoder, from tensors alone.
+        """Run backbone, neck and BEV encoder on tensors, without meta dicts.
 
         Args:
             imgs: Normalised and augmented images. (B, V, 3, H, W)
-            calibration: A tensor for each array that the encoder reads. (B, ...)
+            calibration: A tensor for each calibration array that the encoder reads. (B, ...)
+
+        Returns:
+            Outputs of the BEV encoder, in float32 under ``autocast``.
         """
         encoder: Any = self.bev_encoder
         size = (imgs.shape[-2], imgs.shape[-1])
@@ -252,12 +260,19 @@ class MapDetector(Base3DDetector):
     def over_time(
         self, outputs: dict[str, Any], batch_data_samples: Samples
     ) -> Iterator[BatchMemory]:
-        """Context of a batch with its memory, if the model has a memory.
+        """Context manager that recalls the memory of a batch, if the model has a memory.
 
         At the end of the context, the memory and the map prior are updated.
+
+        Args:
+            outputs: Outputs of the encoders.
+            batch_data_samples: Samples of the batch.
+
+        Yields:
+            The outputs with the memory, and the hooks of the head.
         """
         metas = [sample.metainfo for sample in batch_data_samples]
-        # The hook gets the predictions from the head; the prior is updated with them afterwards.
+        # The hook receives the predictions of the head, with which `keep` updates the prior below.
         prior_hook = None if self.prior is None else self.prior.hook(outputs)
         with ExitStack() as stack:
             batch = BatchMemory(outputs)
@@ -270,14 +285,15 @@ class MapDetector(Base3DDetector):
             self.prior.keep(prior_hook, metas)
 
     def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """All losses as scalars, by name.
+        """Compute all losses as scalars, by name.
 
         Args:
             batch_inputs: Inputs of the batch: ``imgs``, ``voxels`` or both.
             batch_data_samples: Samples with ground truth.
 
         Raises:
-            FloatingPointError: If a loss is not finite (`LossCheck`).
+            FloatingPointError: If a loss is not finite. On a GPU, the error is raised in the next
+                step (`LossCheck`).
         """
         losses = self._losses(batch_inputs, batch_data_samples)
         scalars = {}
@@ -288,7 +304,7 @@ class MapDetector(Base3DDetector):
         return scalars
 
     def _losses(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Losses of the head by name; `loss` averages a loss that is not a scalar."""
+        """Compute the losses of the head by name. Losses that are not scalars are not averaged."""
         if self.step_graphs is not None:
             imgs = self.augment_images(batch_inputs["imgs"])
             metas = [sample.metainfo for sample in batch_data_samples]
@@ -317,7 +333,7 @@ class MapDetector(Base3DDetector):
         return total, {"loss": total, **losses}
 
     def predict(self, batch_inputs: Inputs, batch_data_samples: Samples) -> list[Det3DDataSample]:
-        """Predict, and add the result of the head as ``pred_instances_3d`` to the samples."""
+        """Predict map elements, and add them to the samples as ``pred_instances_3d``."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         with self.over_time(outputs, batch_data_samples) as batch:
             results = self.map_head.predict(batch.outputs, batch_data_samples, **batch.hooks)
@@ -329,13 +345,13 @@ class MapDetector(Base3DDetector):
         return self.add_pred_to_datasample(batch_data_samples, results)
 
     def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Raw outputs of the head."""
+        """Return the raw outputs of the head."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         with self.over_time(outputs, batch_data_samples) as batch:
             return self.map_head(batch.outputs, **batch.hooks)
 
     def _dump_init_info(self) -> None:
-        """Log the initialisation of each weight, hundreds of lines, at debug level only."""
+        """Log the initialisation of each weight, but only at debug level: it has many lines."""
         handlers = MMLogger.get_current_instance().handlers
         if min(handler.level for handler in handlers) <= logging.DEBUG:
             super()._dump_init_info()

@@ -11,10 +11,10 @@ from gsmap.utils.errors import NotFiniteError
 
 
 class PendingCheck(NamedTuple):
-    """Check of one step whose result may still be on the way to the host.
+    """Check of one step, whose result may not have reached the host yet.
 
     Attributes:
-        is_finite: One value per loss, a copy on the host that is awaited when it is read.
+        is_finite: One flag per loss. Reading them waits for the copy to the host.
         names: Names of the losses.
         tokens: Tokens of the samples.
     """
@@ -25,12 +25,11 @@ class PendingCheck(NamedTuple):
 
 
 class LossCheck:
-    """Check of losses that raises an error if one is not finite.
+    """Check of losses that raises an error if a loss is not finite.
 
-    On a CPU the error is raised in the same step, on a GPU in the next one.
-
-    On a GPU the result is copied to the host while the step continues, and `finish` waits for it.
-    A copy of the object has no pending check.
+    On a CPU, the error is raised in the step of the loss, on a GPU in the next step: the result is
+    copied to the host while the step continues, and `finish` waits for it. A copy of the object has
+    no pending check.
     """
 
     def __init__(self) -> None:
@@ -40,15 +39,15 @@ class LossCheck:
         return {"_pending": None}
 
     def start(self, losses: Mapping[str, Tensor], tokens: Sequence[Any]) -> None:
-        """Finish the check of the previous step, and start the one of this step.
+        """Finish the check of the previous step, and start the check of this step.
 
         Args:
             losses: Scalars by name.
             tokens: Tokens of the samples, for the message.
 
         Raises:
-            FloatingPointError: If a loss of the previous step is not finite; on a CPU also if one
-                of this step is not. The message names losses and samples.
+            FloatingPointError: If a loss of the previous step is not finite. On a CPU, also if a
+                loss of this step is not finite. The message names losses and samples.
         """
         self.finish()
         scalars = []
@@ -72,7 +71,8 @@ class LossCheck:
         check = self._pending
         self._pending = None
         bad = []
-        for name, is_finite in zip(check.names, check.is_finite.read().tolist(), strict=True):
+        flags = check.is_finite.read().tolist()
+        for name, is_finite in zip(check.names, flags, strict=True):
             if not is_finite:
                 bad.append(name)
         if bad:

@@ -1,9 +1,9 @@
 """Forward and backward pass of a training step as replayed CUDA graphs.
 
 A training step consists of thousands of small operations, and a GPU waits for the host to launch
-each of them. Up to the predictions, sizes of tensors do not depend on values, so these operations
-are recorded once per size of a batch and replayed for later batches. Matching and losses follow
-the ground truth and are launched as usual.
+each of them. From the images to the predictions, the sizes of tensors do not depend on values, so
+these operations are recorded once per size of a batch and replayed for later batches. The sizes in
+matching and losses depend on the ground truth, so these are launched as usual.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,7 @@ from gsmap.structures.tensors import matrix_products
 from gsmap.utils.errors import InputError, WorkError
 
 SWITCH = "cuda_graphs"  # setting of `MapDetector`
-_MOST_SIZES = 4  # recorded sizes of a batch; each occupies the memory of a step
+_MOST_SIZES = 4  # largest number of recordings; each occupies the memory of a step
 _WARM_UP = 3  # steps before a recording, in which libraries select and load kernels
 
 
@@ -56,7 +56,7 @@ def reason_against_recording(model: Any) -> str:
 
 
 class StaticStep(nn.Module):
-    """A model from augmented images to the predictions of every layer, as a function of tensors.
+    """Function of tensors from augmented images to the predictions of every layer of a model.
 
     Args:
         model: A `MapDetector` whose steps can be recorded. Its encoder is switched to operations
@@ -89,8 +89,8 @@ class StaticStep(nn.Module):
         arrays = dict(zip(self.names, calibration, strict=True))
         outputs = self.model.encode_images(images, arrays)
         layers = self.model.map_head(outputs)
-        # A function of tensors cannot return objects: their fields are returned instead, and
-        # `restore` builds them again.
+        # Only tensors can be returned. So the predictions are replaced by their fields here, from
+        # which `restore` builds the predictions.
         fields = [(layer.scores, vars(layer.decoded)) for layer in layers]
         self._kinds = [type(layer.decoded) for layer in layers]
         tensors, self._structure = tree_flatten((outputs, fields))
@@ -122,10 +122,10 @@ class _Recording:
         forward: Graph of the forward pass.
         backward: Graph of the backward pass.
         inputs: Tensors that the forward pass reads.
-        outputs: Tensors that it writes.
+        outputs: Tensors that the forward pass writes.
         output_grads: Gradients that the backward pass reads; None for outputs without gradients.
-        param_grads: Gradients that it writes, one for each trained parameter; None for parameters
-            that the outputs do not depend on.
+        param_grads: Gradients that the backward pass writes, one for each trained parameter; None
+            for parameters that the outputs do not depend on.
     """
 
     step: StaticStep
@@ -138,10 +138,11 @@ class _Recording:
 
 
 class StepGraphs:
-    """Runs the forward passes of a training, on a GPU as recorded CUDA graphs with gradients.
+    """Computes the predictions of training steps; on a GPU, by recorded CUDA graphs.
 
-    Recording leaves buffers and random numbers as they were, so that a training does not depend on
-    the steps at which it records. On a CPU, operations are computed as usual.
+    The gradients are computed by recorded graphs, too. Recording restores the buffers of the model
+    and the state of the random numbers, so the result of a training does not depend on the steps at
+    which it records. On a CPU, operations are computed as usual.
     """
 
     def __init__(self) -> None:
@@ -162,8 +163,8 @@ class StepGraphs:
 
         Raises:
             RuntimeError: If a step of this size cannot be recorded.
-            ValueError: If gradients of an earlier step are still there, or autocast is enabled
-                around the model.
+            ValueError: If gradients of an earlier step have not been set to None, or autocast is
+                enabled around the model.
         """
         if torch.is_autocast_enabled(images.device.type):
             # Autocast caches weights cast to half precision: all later steps would use the cached
@@ -301,7 +302,7 @@ def _record(model: Any, inputs: Sequence[Tensor], params: Sequence[Tensor]) -> _
 
 
 def _empty_grads(outputs: Sequence[Tensor]) -> list[Tensor | None]:
-    """Memory for the gradient of each output; None for outputs without gradients."""
+    """Allocate memory for the gradient of each output; None for outputs without gradients."""
     return [torch.zeros_like(output) if output.requires_grad else None for output in outputs]
 
 

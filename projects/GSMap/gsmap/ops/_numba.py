@@ -1,6 +1,7 @@
 """Helpers of the numba kernels: ranges of pixels, and threads over instances.
 
-Numba's cache watches only the file of a kernel: delete ``__pycache__`` after a change in this file.
+Numba's cache notices changes of the file of a kernel only. Delete ``__pycache__`` after a change of
+this file.
 """
 
 import math
@@ -37,7 +38,10 @@ def run_in_threads(kernel: Callable[..., None], pixels: int, *arguments: Any) ->
         *arguments: Arguments of the kernel. The length of the first one is the number of instances.
             A tensor becomes an array, and an output must be a contiguous tensor.
     """
-    arrays = [a.contiguous().numpy() if isinstance(a, Tensor) else a for a in arguments]
+    arrays = []
+    for argument in arguments:
+        is_tensor = isinstance(argument, Tensor)
+        arrays.append(argument.contiguous().numpy() if is_tensor else argument)
     count = len(arrays[0])
 
     def run(first: int, last: int) -> None:

@@ -1,4 +1,4 @@
-"""Choice between plain torch and the fused kernels, which are registered as operators of torch."""
+"""Choice between plain torch and fused kernels, and registration of the kernels with torch."""
 
 import os
 import warnings
@@ -17,9 +17,9 @@ PACKAGES = {"cpu": "numba", "triton": "triton"}
 DEVICES = {"cpu": "cpu", "triton": "cuda"}
 INSTALLED = {backend: find_spec(package) is not None for backend, package in PACKAGES.items()}
 
-# Functions with a Triton kernel, and whether backend="auto" selects it for tensors on a GPU. It
-# does so only if the kernel was tested against the reference on a GPU. backend="triton" selects
-# any of them.
+# Functions with a Triton kernel, and whether backend="auto" selects the kernel for tensors on a
+# GPU. This is True only for kernels that were tested against the reference on a GPU.
+# backend="triton" can select every kernel.
 TRITON_KERNELS = {
     "deformable_sample": True,
     "draw_polylines": True,
@@ -31,12 +31,12 @@ TRITON_KERNELS = {
     "soft_rasters": True,
 }
 SWITCH = "GSMAP_TRITON_KERNELS"  # environment variable: further kernels for "auto", or "all"
-# Triton kernels that add gradients by atomics in any order, which is not deterministic.
+# Triton kernels that are not deterministic, because atomics add their gradients in any order.
 UNORDERED = ("deformable_sample", "sample_kernels")
 
 
 def triton_kernels(switch: str) -> set[str]:
-    """Select the functions whose Triton kernels ``"auto"`` takes.
+    """Return the functions whose Triton kernels ``"auto"`` selects.
 
     Args:
         switch: Names of further functions, separated by commas, or ``"all"``.
@@ -70,9 +70,9 @@ def choose_backend(
 
     Args:
         backend: Name of a backend, or ``"auto"``. The latter selects the fused kernels for the
-            device and type of the tensor, or the reference if there are none.
-        tensor: Input of the operation, whose device and type decide.
-        fused: Fused kernels of the operation: ``"cpu"`` (numba), ``"triton"``.
+            device and type of the tensor, or the reference in plain torch if there are none.
+        tensor: Input of the operation, whose device and type determine the backend.
+        fused: Backends for which the operation has fused kernels: ``"cpu"`` (numba), ``"triton"``.
         kernel: Name of the function in ``TRITON_KERNELS``, if it has a Triton kernel.
 
     Returns:
@@ -87,7 +87,7 @@ def choose_backend(
         raise InputError(f"backend must be one of {choices}, got {backend!r}.")
     if backend == "reference":
         return backend
-    # Whether the Triton kernel must not be used, because deterministic algorithms are asked for.
+    # Whether the Triton kernel must not be used, because the user requires determinism.
     is_excluded = kernel in UNORDERED and torch.are_deterministic_algorithms_enabled()
     if backend == "auto":
         takes_triton = kernel in AUTO_KERNELS and not is_excluded
@@ -136,13 +136,14 @@ def fused_operator(
 
     Registered operators work under torch.compile, autocast, DistributedDataParallel and gradient
     checkpointing. Only inputs are saved for the backward pass, which can therefore run twice
-    (``retain_graph``). Differentiating a gradient raises a RuntimeError.
+    (``retain_graph``). Second derivatives are not supported and raise a RuntimeError.
 
     Args:
         name: ``<folder>.<function>``. The modules ``numba.py`` and ``triton.py`` of the folder are
             imported at their first use. They define the function, which returns a tensor. They also
-            define ``<function>_backward``. It takes the gradient of the output before the arguments
-            of the function, and returns a sequence of contiguous gradients.
+            define ``<function>_backward``. Its first argument is the gradient of the output,
+            followed by the arguments of the function. It returns a sequence of contiguous
+            gradients.
         arguments: Arguments of the function in the syntax of a torch schema, tensors first. The
             operator takes the backend as a further, last argument.
         shape: Function from the arguments to the shape of the output.
@@ -159,7 +160,7 @@ def fused_operator(
         module = import_module(f"gsmap.ops.{folder}.{PACKAGES[backend]}")
         return getattr(module, function)
 
-    # The last one of `inputs` is the backend.
+    # In the functions below, the last entry of `inputs` is the backend.
     def forward(*inputs: Any) -> Tensor:
         kernel = load_kernel(inputs[-1], function)
         return kernel(*inputs[:-1])

@@ -19,9 +19,10 @@ def modulated_deform_conv(
     groups: int,
     deform_groups: int,
 ) -> Tensor:
-    """Convolve images with a filter whose taps are shifted and weighted, like mmcv's operator.
+    """Convolve images with filters whose taps are shifted and weighted at each output pixel.
 
-    Images are zero outside of their borders.
+    The results equal mmcv's operator. A tap is an entry of a filter. Images are zero outside of
+    their borders.
 
     Args:
         images: Input images. (B, C, H, W)

@@ -33,7 +33,8 @@ from gsmap.utils.errors import InputError
 
 _MOST_ELEMENTS = 1_000_000
 _MOST_VERTICES = 4_000_000  # of all elements together
-_MOST_VERTICES_OF_CROSSED_AREA = 50  # whose repair takes longer with the number of crossings
+# Limit for areas whose outline crosses itself: each crossing makes the repair slower.
+_MOST_VERTICES_OF_CROSSED_AREA = 50
 _FARTHEST_M = 1e7  # largest coordinate of a vertex
 _COUNTS = np.dtype([("elements", "<u4"), ("vertices", "<u4")])
 _STORED = np.dtype([("label", "<u2"), ("score", "<f4"), ("num_vertices", "<u4")])
@@ -55,9 +56,9 @@ class _Bounds(NamedTuple):
 class ElementPrior:
     """Elements of the map of a place, each with a class and a confidence.
 
-    The confidence of an element is its score: the share of the earlier frames that found it where
-    it was in view. The prior does not change, so all methods may be called from several threads.
-    All elements are in memory.
+    The confidence of an element is its score: of the earlier frames in whose view it was, the share
+    that found it. All elements are in memory. The prior does not change, so all methods may be
+    called from several threads.
 
     Args:
         settings: Classes, place and tiles of the file; the size of cells is not used.
@@ -67,7 +68,7 @@ class ElementPrior:
             default.
 
     Attributes:
-        content: Name of the stored things, for messages.
+        content: Word for the stored data in messages.
 
     Raises:
         ValueError: If a label, a score or a vertex is out of range, an element has no length, the
@@ -167,7 +168,8 @@ class ElementPrior:
         x0, x1 = grid.x_range
         y0, y1 = grid.y_range
         corners = frame.to_global(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
-        # Whether the bounding box of an element overlaps the one of the range, by axis. (N, 2)
+        # Along each axis, compare the bounding box of each element with the one of the range. Both
+        # overlap if each begins before the other ends. (N, 2)
         starts_before = self._bounds.low <= corners.max(axis=0)
         ends_behind = self._bounds.high >= corners.min(axis=0)
         is_near = (starts_before & ends_behind).all(axis=1)
@@ -183,11 +185,11 @@ class ElementPrior:
         )
 
     def read(self, pose: Pose, grid: BEVGrid) -> Tensor:
-        """Draw the elements in the cells of a frame, a raster like the one of `MapPrior.read`.
+        """Draw the elements in the cells of a frame, as a raster like the one of `MapPrior.read`.
 
-        Closed elements of `AREA_CLASSES` are filled. A cell has the confidence of the element that
-        covers it, times the covered share of its area. Of several elements of a class, the largest
-        value counts.
+        Closed elements of `AREA_CLASSES` are filled. The value of a cell is the confidence of the
+        element that covers it, times the covered share of the cell. If several elements of a class
+        cover a cell, it has the largest of their values.
 
         Args:
             pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
@@ -220,7 +222,7 @@ class ElementPrior:
         return raster.to(pose.device) if isinstance(pose, Tensor) else raster
 
     def _packed_tiles(self) -> list[tuple[TileKey, bytes]]:
-        """Elements in the tile of their first vertex, compressed."""
+        """Group the elements by the tile of their first vertex, and compress each group."""
         rows_of_tile: dict[TileKey, list[int]] = defaultdict(list)
         first_vertices = self.elements.points[self.elements.offsets[:-1]]
         tiles = np.floor(first_vertices / self.settings.tile_m).astype(np.int64)
@@ -246,7 +248,7 @@ def _bounds(elements: MapElements) -> _Bounds:
 
 
 def _pack(elements: MapElements) -> bytes:
-    """Numbers of elements and vertices, followed by compressed elements and vertices."""
+    """Encode elements: first the numbers of elements and vertices, then both, compressed."""
     stored = np.zeros(len(elements), _STORED)
     stored["label"] = elements.labels
     stored["score"] = elements.confidence
@@ -285,7 +287,7 @@ def _unpack(
         most_vertices: Largest number of vertices, and of elements, that the tile may have.
 
     Returns:
-        Stored elements (N,), and the vertices of each one. N x (P, 2)
+        Stored elements (N,), and the vertices of each element. (P, 2) each
     """
     damage = InputError(f"{path} is damaged: a tile cannot be read; copy or build it again.")
     if zlib.crc32(content) != crc or len(content) < _COUNTS.itemsize:

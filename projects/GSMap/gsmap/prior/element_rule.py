@@ -12,7 +12,8 @@ class ElementRule:
     Args:
         sigma_m: Standard deviation of the points of an element across its line, in [0.01, 5]
             metres.
-        line_width_m: Width of an element in the cells of a frame, in [0.05, 5] metres.
+        line_width_m: Width with which an element is drawn to the cells of a frame, in [0.05, 5]
+            metres.
 
     Raises:
         ValueError: If a setting is out of range.
@@ -29,4 +30,4 @@ class ElementRule:
 
 
 ELEMENT_RULES: dict[str, type] = {"elements": ElementRule}
-"""Settings of priors of elements by their name in files."""
+"""Classes of the settings of priors of elements, by the name of the kind of prior in files."""

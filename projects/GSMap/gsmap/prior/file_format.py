@@ -1,4 +1,4 @@
-"""File of a prior of any kind: a header, compressed tiles and an index.
+"""File format of all kinds of map priors: a header, compressed tiles and an index.
 
 The file begins with the magic number, the version and the length of the header, all little-endian.
 The header is JSON in UTF-8. Compressed tiles (zlib) follow, then the index with the column, row,
@@ -43,7 +43,7 @@ _FOOTER = struct.Struct("<QIII8s")
 _INDEX = np.dtype(
     [("column", "<i4"), ("row", "<i4"), ("offset", "<u8"), ("length", "<u4"), ("crc", "<u4")]
 )
-_LONGEST_HEADER = 1 << 16
+_LONGEST_HEADER = 1 << 16  # in bytes
 
 
 class _Kind(NamedTuple):
@@ -52,7 +52,7 @@ class _Kind(NamedTuple):
     Attributes:
         title: Name of the kind, for messages.
         writer: Name of the class that writes such files.
-        rules: Classes of the settings of such a prior, by their names in files.
+        rules: Classes of the rules of such a prior, by their names in files.
     """
 
     title: str
@@ -78,9 +78,9 @@ def save_file(
 
     Args:
         path: File to create or replace.
-        settings: Classes, place and cells.
-        rule: Rule of the stored states.
-        tiles: Place and compressed states of each tile.
+        settings: Classes, place and cells of the prior.
+        rule: Rule that computes the stored states.
+        tiles: Column and row, and compressed states, of each tile.
         magic: First bytes of the kind of file.
 
     Raises:
@@ -101,7 +101,7 @@ def read_file(
 
     Args:
         path: The file.
-        settings: Classes, place and tiles that it must have; None to accept any.
+        settings: Settings that the file must have; None to accept any.
         magic: First bytes of the kind of file.
 
     Returns:
@@ -130,8 +130,8 @@ def write_tiles(
 
     Args:
         file: Empty file.
-        settings: Classes, cells, and name of the global frame.
-        rule: Rule of the stored states.
+        settings: Classes, place and cells of the prior.
+        rule: Rule that computes the stored states.
         tiles: Column and row, and compressed states, of each tile.
         magic: First bytes of the kind of file.
     """
@@ -161,7 +161,7 @@ def read_header(
         magic: First bytes of the kind of file.
 
     Returns:
-        Settings, rule, and offset, length and checksum of each tile.
+        Settings, rule, and the offset, length and checksum of each tile by column and row.
 
     Raises:
         ValueError: If the file is no valid prior.
@@ -205,7 +205,7 @@ def _cut(path: Path) -> InputError:
 def _parse_header(
     header: bytes, path: Path, rules: Mapping[str, type]
 ) -> tuple[PriorSettings, Any]:
-    """Check the settings of a header."""
+    """Parse and check a header. Return the settings and the rule of the prior."""
     fields = ["cell_m", "classes", "place", "rule", "tile_m"]
     try:
         values: Any = json.loads(header)
@@ -223,7 +223,7 @@ def _parse_header(
 
 
 def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey, TileEntry]:
-    """Check the index; tiles lie between the bytes ``start`` and ``end``."""
+    """Parse and check the index of a file, whose tiles are in the bytes ``start`` to ``end``."""
     rows = np.frombuffer(index, dtype=_INDEX)
     offsets = rows["offset"]
     # Bytes between the start of a tile and the index. Offsets are unsigned integers, so without the
@@ -254,7 +254,7 @@ def unpack_tile(content: bytes, crc: int, num_bytes: int, path: Path | str) -> b
     Args:
         content: Compressed tile.
         crc: Expected checksum of ``content``.
-        num_bytes: Size of the states in bytes.
+        num_bytes: Expected size of the decompressed states in bytes.
         path: Name of the file, for messages.
 
     Raises:
@@ -262,6 +262,7 @@ def unpack_tile(content: bytes, crc: int, num_bytes: int, path: Path | str) -> b
     """
     unpacker = zlib.decompressobj()
     try:
+        # One more byte than expected is enough to detect a tile that is too large.
         states = unpacker.decompress(content, num_bytes + 1)
     except zlib.error:
         states = b""

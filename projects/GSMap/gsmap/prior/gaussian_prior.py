@@ -1,4 +1,4 @@
-"""Gaussian prior: the lines of earlier drives as Gaussians in the global frame, in tiles."""
+"""Gaussian prior: the lines of earlier drives, stored as Gaussians in tiles of the global frame."""
 
 import threading
 import zlib
@@ -70,20 +70,20 @@ class GaussianMasks(NamedTuple):
 class GaussianPrior:
     """Gaussians along the lines of earlier drives, each with a class, counts and a covariance.
 
-    A Gaussian stands for a piece of a line. Its centre and its variance across the line are updated
-    by every frame that has it in view: a Kalman filter in information form. Its standard deviation
-    along the line is half of the distance of neighbouring Gaussians. It also has counts of hits and
-    misses, which decay. A frame that has the Gaussian in view adds the score p of the line that
-    measures it, or p = 0 without such a line, to its hits, and 1 - p to its misses. Areas are
-    stored as their outlines. All methods may be called from several threads. All Gaussians are in
-    memory.
+    A Gaussian represents a piece of a line. Every line that measures it updates its centre, its
+    direction and its variance across the line, by a Kalman filter in information form. Its standard
+    deviation along the line is half of the distance between neighbouring Gaussians. It also has
+    counts of hits and misses, which decay. A frame that has the Gaussian in view adds p to its hits
+    and 1 - p to its misses, where p is the score of the line that measures it, or 0 without such a
+    line. Areas are stored as their outlines. All methods may be called from several threads. All
+    Gaussians are kept in memory.
 
     Args:
         settings: Classes, place and tiles; the size of cells is not used.
         rule: Settings of the Gaussians; ``GaussianRule()`` by default.
 
     Attributes:
-        content: Name of the stored things, for messages.
+        content: Name of the stored objects, for messages.
     """
 
     content: ClassVar[str] = "Gaussians"
@@ -149,8 +149,10 @@ class GaussianPrior:
         active = active.select(active.labels == label)
         cos = np.cos(active.angles)
         sin = np.sin(active.angles)
-        # Rotation matrices, whose columns are the directions along and across the line.
-        axes = np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
+        # Rotation matrices, whose columns are the directions along and across the line. (N, 2, 2)
+        first_rows = np.stack([cos, -sin], axis=-1)
+        second_rows = np.stack([sin, cos], axis=-1)
+        axes = np.stack([first_rows, second_rows], axis=-2)
         along = np.full(len(cos), (self.rule.spacing_m / 2) ** 2)
         variances = np.stack([along, active.variances], axis=-1)
         covariances = (axes * variances[:, None, :]) @ axes.transpose(0, 2, 1)
@@ -162,9 +164,9 @@ class GaussianPrior:
         """Update the prior with the prediction of a frame.
 
         A Gaussian is measured by the nearest line of its class that crosses its normal within
-        1.5 m. Gaussians in view without such a line count a miss. A new Gaussian is added at each
-        point of a line that no Gaussian of its class is near: none within 1.5 m across the line and
-        three quarters of the spacing along it.
+        1.5 m. For a Gaussian in view without such a line, a miss is counted. Each line is sampled
+        at points. A new Gaussian is added at each point without a Gaussian of its class within
+        1.5 m across the line and three quarters of the spacing along it.
 
         Args:
             pose: Transform from the frame to the global frame, in metres. Far from the origin it
@@ -202,7 +204,7 @@ class GaussianPrior:
                 kept = of_class.select(~of_class.are_forgotten(self.rule))
                 parts.append(kept)
                 parts.append(_new_gaussians(kept, lines, label=label, rule=self.rule))
-            # All Gaussians of the tiles in view are distributed again, as some have moved.
+            # Some Gaussians may have moved to another tile, so all of them are distributed again.
             for key in keys:
                 self._tiles.pop(key, None)
             _Active.join(parts).scatter(self._tiles, self.settings.tile_m)
@@ -242,7 +244,8 @@ class GaussianPrior:
             keys = self._keys_in_view(frame, grid)
             active = _Active.gather(self._tiles, keys, self.settings.tile_m)
         active = active.select(active.values(self.rule) >= self.rule.least_value)
-        # Gaussians of each class, padded to the number n of the largest class. (C, n, ...)
+        # Gaussians of each class, padded to the number n of the class with the most Gaussians:
+        # arrays (C, n, ...).
         num_classes = len(self.settings.classes)
         counts = np.bincount(active.labels, minlength=num_classes)
         shape = (num_classes, max(1, int(counts.max(initial=0))))
@@ -270,7 +273,7 @@ class GaussianPrior:
         return GaussianMasks(masks[0], spread=masks[1])
 
     def _keys_in_view(self, frame: PlanarPose, grid: BEVGrid) -> list[TileKey]:
-        """Columns and rows of the tiles in view of a frame or at most a margin outside of the view.
+        """Keys (column, row) of the stored tiles in view of a frame or in a margin around the view.
 
         The margin is for lines that cross the edge of the view.
         """
@@ -382,7 +385,7 @@ class _Active:
             is_in_view: Whether a Gaussian is in view. (N,)
             rule: Settings.
         """
-        # A line at the edge of the view may measure a Gaussian that is just outside.
+        # A line at the edge of the view may measure a Gaussian that is just outside of the view.
         is_observed = is_in_view | measurements.is_found
         variances, gains = fuse_across(
             self.variances, measurements, rule.decay, least_variance=rule.least_sigma_m**2
@@ -397,8 +400,8 @@ class _Active:
         self.misses = decay * self.misses + np.where(is_observed, 1.0 - scores, 0.0)
 
     def scatter(self, tiles: dict[TileKey, Stored], tile_m: float) -> None:
-        """Distribute the Gaussians to tiles, to whose content they are added."""
-        tile_keys = np.floor(self.means / tile_m).astype(np.int64)  # column and row of each. (N, 2)
+        """Add each Gaussian to the tile that contains its centre."""
+        tile_keys = np.floor(self.means / tile_m).astype(np.int64)  # columns and rows. (N, 2)
         # Versions of NumPy differ in the shape of the inverse, (N,) or (N, 1).
         keys, key_indices = np.unique(tile_keys, axis=0, return_inverse=True)
         key_indices = key_indices.ravel()

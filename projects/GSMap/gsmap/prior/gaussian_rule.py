@@ -10,19 +10,19 @@ class GaussianRule:
     """Settings of the Gaussians of a prior and of their update.
 
     Args:
-        spacing_m: Distance of new Gaussians along a line, in [0.2, 5] metres. The standard
+        spacing_m: Distance between new Gaussians along a line, in [0.2, 5] metres. The standard
             deviation of a Gaussian along its line is half of this distance.
-        sigma_m: Standard deviation across the line for predictions that have no Gaussians, in
-            [0.01, 5] metres.
+        sigma_m: Standard deviation across the line for predictions without Gaussians, in [0.01, 5]
+            metres.
         least_sigma_m: Smallest standard deviation of a Gaussian across its line, in [0.001, 1]
             metres, which covers the errors that all frames share.
         line_sigma_m: Standard deviation of a drawn line across its direction, in [0.05, 2] metres.
-        decay: Factor in [0.5, 1]. It multiplies the older hits and misses each time that a frame
-            has the Gaussian in view, and the inverse of the older variance across its line each
-            time that a line measures it.
-        prior_count: Pseudo-count of misses, in [0.01, 100].
-        least_value: Smallest value of a drawn Gaussian, in [0, 1]; the value is hits / (hits +
-            misses + ``prior_count``).
+        decay: Factor in [0.5, 1] by which older data lose weight. Each frame that has the Gaussian
+            in view multiplies the older hits and misses by it. Each line that measures the Gaussian
+            multiplies the inverse of the older variance across the line by it.
+        prior_count: Number of misses that is added in the value of a Gaussian, in [0.01, 100].
+        least_value: Smallest value of a Gaussian that is drawn, in [0, 1]. The value is
+            hits / (hits + misses + ``prior_count``).
 
     Raises:
         ValueError: If a setting is out of range.

@@ -20,7 +20,7 @@ _LEAST_COSINE = np.cos(np.radians(30.0))  # between a Gaussian and a line that m
 _SIGMA_PER_M = 0.02  # standard deviation per metre of distance from the vehicle
 # No Gaussian is added nearer to another one, along a line, than this share of the spacing.
 _COVERED = 0.75
-_ROUNDING_M = 1e-3  # covers the rounding of stored positions at the ends of a line
+_ROUNDING_M = 1e-3  # tolerance at the ends of a line, for the rounding of stored positions
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,18 +171,18 @@ def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measur
     is_match = crosses & (np.abs(distances) <= REACH_M) & (lengths[segments] > 0)
     is_match &= np.abs(extent) >= _LEAST_COSINE * lengths[segments]
     matches = np.flatnonzero(is_match)
-    # Sorted by Gaussian, then by distance, then by segment: the first of a Gaussian is the best.
+    # Sort by Gaussian, distance and segment, so that the first match of a Gaussian is its best one.
     order = np.lexsort((segments[matches], np.abs(distances[matches]), rows[matches]))
     matches = matches[order]
     index, first = np.unique(rows[matches], return_index=True)
     best = matches[first]
-    points = lines.starts[segments[best]]
-    start_variances = lines.variances[points]
-    end_variances = lines.variances[points + 1]
+    start_indices = lines.starts[segments[best]]  # of the points at which the best segments start
+    start_variances = lines.variances[start_indices]
+    end_variances = lines.variances[start_indices + 1]
     found.is_found[index] = True
     found.distances[index] = distances[best]
     found.turns[index] = np.arctan(rise[best] / extent[best])
-    found.scores[index] = lines.scores[points]
+    found.scores[index] = lines.scores[start_indices]
     found.variances[index] = start_variances + fraction[best] * (end_variances - start_variances)
     return found
 
@@ -222,11 +222,12 @@ def find_covered_points(
         return is_covered
     most_along_m = _COVERED * spacing_m
     radius_m = float(np.hypot(most_along_m, REACH_M))
-    points, rows = _near_pairs(lines.points, means, radius_m=radius_m)
-    offsets = np.abs(_offsets(lines.points[points], means[rows], angles=angles[rows]))
-    cosine = np.abs(np.cos(lines.angles[points] - angles[rows]))
+    point_indices, rows = _near_pairs(lines.points, means, radius_m=radius_m)
+    offsets = np.abs(_offsets(lines.points[point_indices], means[rows], angles=angles[rows]))
+    cosine = np.abs(np.cos(lines.angles[point_indices] - angles[rows]))
     is_near = (offsets[:, 0] <= most_along_m) & (offsets[:, 1] <= REACH_M)
-    is_covered[points[is_near & (cosine >= _LEAST_COSINE)]] = True
+    is_parallel = cosine >= _LEAST_COSINE
+    is_covered[point_indices[is_near & is_parallel]] = True
     return is_covered
 
 
@@ -235,11 +236,12 @@ def fuse_across(
 ) -> tuple[FloatArray, FloatArray]:
     r"""Multiply Gaussians with their measurements, in information form.
 
-    A line measures the position across it alone: its information is :math:`n n^T / \sigma_m^2` with
-    the normal n. The variance across becomes :math:`1 / (\lambda / \sigma^2 + 1 / \sigma_m^2)` with
-    the decay :math:`\lambda`, and the centre moves by the gain
-    :math:`\sigma_{new}^2 / \sigma_m^2` times the distance. The least variance limits only the new
-    variance, not the gain. A Gaussian without a measurement does not change.
+    A line with normal n measures only the position across the line, with the variance
+    :math:`\sigma_m^2`. Its information is :math:`n n^T / \sigma_m^2`. The variance of the Gaussian
+    across the line becomes :math:`1 / (\lambda / \sigma^2 + 1 / \sigma_m^2)` with the decay
+    :math:`\lambda`, and its centre moves by the gain :math:`\sigma_{new}^2 / \sigma_m^2` times the
+    distance. The least variance limits only the new variance, not the gain. A Gaussian without a
+    measurement does not change.
 
     Args:
         variances: Variances across the lines, in square metres. (N,)

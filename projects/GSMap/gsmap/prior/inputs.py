@@ -33,12 +33,12 @@ class PlanarPose(NamedTuple):
     y_m: float
 
     def to_global(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Transform points of the frame to the global frame. (n, 2) -> (n, 2)"""
+        """Transform points from the frame to the global frame, in metres. (n, 2) -> (n, 2)"""
         rotation = np.array([[self.cos, -self.sin], [self.sin, self.cos]])
         return points @ rotation.T + np.array([self.x_m, self.y_m])
 
     def to_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Transform points of the global frame to the frame. (n, 2) -> (n, 2)"""
+        """Transform points from the global frame to the frame, in metres. (n, 2) -> (n, 2)"""
         rotation = np.array([[self.cos, -self.sin], [self.sin, self.cos]])
         return (points - np.array([self.x_m, self.y_m])) @ rotation
 
@@ -55,12 +55,13 @@ def planar_pose(pose: Pose) -> PlanarPose:
     transform = to_numpy(pose).astype(np.float64, copy=False)
     if transform.shape != (4, 4) or not is_rigid(transform):
         raise InputError("pose must be a rigid transform of shape (4, 4).")
-    if np.abs(transform[:2, 3]).max() > _FARTHEST_M:
+    largest_coordinate_m = np.abs(transform[:2, 3]).max()
+    if largest_coordinate_m > _FARTHEST_M:
         raise InputError(
-            f"pose is {np.abs(transform[:2, 3]).max():.3g} m from the origin; at most "
+            f"pose is {largest_coordinate_m:.3g} m from the origin; at most "
             f"{_FARTHEST_M:g} m are possible."
         )
-    axis = transform[:2, 0]
+    axis = transform[:2, 0]  # x axis of the frame, projected to the plane
     length = float(np.hypot(axis[0], axis[1]))
     if length < 1e-6:
         raise InputError("pose has no yaw: its x axis is vertical.")

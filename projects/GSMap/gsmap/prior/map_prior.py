@@ -1,4 +1,4 @@
-"""Map prior: a raster of the map in the global frame, in tiles."""
+"""Map prior: a raster of the map in the global frame, stored as square tiles."""
 
 import mmap
 import os
@@ -25,7 +25,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
 
 MEMORY_BYTES = 100 << 20
-"""Default of the largest size of the tiles in memory."""
+"""Default of ``memory_bytes``, the largest total size of the tiles in memory."""
 # Largest number of the prior's cells in a quadrant of the square around a frame (`_window`).
 _MOST_CELLS = 1 << 24
 
@@ -33,18 +33,21 @@ _MOST_CELLS = 1 << 24
 class MapPrior:
     """Raster of the map at places that a vehicle has passed, with one channel per class.
 
-    A tile is created when a frame is written to it. Beyond ``memory_bytes``, least recently used
-    tiles are moved from memory to a temporary file. All methods may be called from several threads.
-    `read` and `write` use the cell of the prior in which the centre of a cell of the frame lies. It
-    has the index floor(x / cell_m) along x of the global frame, and floor(y / cell_m) along y. Only
-    the position and the yaw of a pose are used, as in `MapElements.to_frame`.
+    The raster consists of square tiles. A tile is created when a frame is first written to it. If
+    the tiles need more than ``memory_bytes``, the least recently used ones are moved from memory to
+    a temporary file. All methods may be called from several threads.
+
+    `read` and `write` use the cell of the prior in which the centre of a cell of the frame lies.
+    For a centre (x, y) in the global frame, this cell has the index floor(x / cell_m) along x and
+    floor(y / cell_m) along y. Only the position and the yaw of a pose are used, as in
+    `MapElements.to_frame`.
 
     Args:
         settings: Classes, place and cells.
         rule: Rule of writing; `HitMissCounts` by default. `LastSeen` and `KeepMaximum` are the
             rules of HRMapNet (arXiv 2409.00620).
-        memory_bytes: Largest size of the tiles in memory; a tile of three classes has 120 kB, with
-            `HitMissCounts` 240 kB.
+        memory_bytes: Largest total size of the tiles in memory. A tile of three classes takes
+            120 kB, or 240 kB with `HitMissCounts`.
     """
 
     def __init__(
@@ -71,17 +74,17 @@ class MapPrior:
         update: bool = False,
         memory_bytes: int = MEMORY_BYTES,
     ) -> "MapPrior":
-        """Open a file that `save` has written; tiles are read when they are needed.
+        """Open a file that `save` has written. Tiles are read when they are needed.
 
         Args:
             path: File of the prior. It may be untrusted.
             settings: Classes, place and cells that the file must have; None to accept any.
             update: Reserve the file for this process until `close`, to save it later. Another
                 process can still read it.
-            memory_bytes: Largest size of the tiles in memory.
+            memory_bytes: Largest total size of the tiles in memory.
 
         Returns:
-            Prior.
+            The prior.
 
         Raises:
             ValueError: If the file is no valid prior, or has other settings.
@@ -162,7 +165,7 @@ class MapPrior:
 
     @property
     def num_tiles(self) -> int:
-        """Number of tiles, in memory or not."""
+        """Number of all tiles, in memory or in a file."""
         with self._lock:
             return len(self._tiles.keys())
 
@@ -180,8 +183,8 @@ class MapPrior:
             grid: Extent and cells of the frame, H rows and W columns.
 
         Returns:
-            Values in [0, 1], 0 where nothing has been written, float32 on the device of ``pose``.
-            (C, H, W)
+            Values of the C classes in [0, 1], 0 where nothing has been written. They are float32 on
+            the device of ``pose``. (C, H, W)
 
         Raises:
             ValueError: If ``pose`` is no rigid transform or too far from the origin, or the grid is
@@ -191,6 +194,7 @@ class MapPrior:
         with self._lock:
             canvas = self._load_canvas(window)
         flat_canvas = _flatten_cells(canvas)
+        # The rule stores S numbers (states) for each class of a cell.
         states = flat_canvas[..., window.cells]  # (S, C, H * W)
         values = self.rule.read(states).reshape(-1, grid.height, grid.width)
         device = pose.device if isinstance(pose, Tensor) else torch.device("cpu")
@@ -207,7 +211,7 @@ class MapPrior:
             pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
                 origin it must be float64. (4, 4)
             grid: Extent and cells of the frame, H rows and W columns.
-            values: Prediction in [0, 1]; 0 is a miss. (C, H, W)
+            values: Prediction of the C classes in [0, 1]; 0 is a miss. (C, H, W)
             visible: Whether a cell is in view and not occluded, bool; None if all are. Other cells
                 do not change. (H, W)
 
@@ -320,7 +324,7 @@ class MapPrior:
         return canvas
 
     def _store_canvas(self, window: "_Window", canvas: States, touched: NDArray[np.int64]) -> None:
-        """Copy a raster back to the tiles in which a cell was touched."""
+        """Copy a raster back to those tiles in which at least one cell was touched."""
         is_touched = np.zeros(window.height * window.width, dtype=np.bool_)
         is_touched[touched] = True
         is_touched = is_touched.reshape(window.height, window.width)
@@ -334,7 +338,15 @@ class MapPrior:
 
 @dataclass(frozen=True)
 class _Part:
-    """Part of a window in one tile."""
+    """Part of a window in one tile.
+
+    Attributes:
+        key: Column and row of the tile.
+        columns: Columns of the part in the window.
+        rows: Rows of the part in the window.
+        tile_columns: Columns of the part in the tile.
+        tile_rows: Rows of the part in the tile.
+    """
 
     key: tuple[int, int]
     columns: slice
@@ -345,11 +357,11 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Window:
-    """Rectangle of cells around the view of a frame.
+    """Rectangle of the prior's cells that covers the grid of a frame.
 
     Args:
-        first_column: Smallest column of the cells, in the global frame.
-        first_row: Smallest row.
+        first_column: Smallest column of the cells, counted from the origin of the global frame.
+        first_row: Smallest row, counted in this way.
         width: Number of columns.
         height: Number of rows.
         cells: Index of each cell of the frame in the rectangle, row by row. (H * W,)
@@ -404,7 +416,7 @@ def _cuts(first: int, length: int, side: int) -> list[tuple[int, slice, slice]]:
 def _largest_per_cell(
     cells: NDArray[np.int64], values: NDArray[np.float32], size: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Largest value of the frame's cells that lie in each cell of the prior.
+    """Compute, for each cell of the prior, the largest value of the frame's cells in it.
 
     Args:
         cells: Cell of the prior in which each cell of the frame lies, as an index into the window,
@@ -433,7 +445,7 @@ def _flatten_cells(canvas: States) -> States:
 
 
 def _map_file(path: Path) -> mmap.mmap:
-    """Map a file that is not empty for reading."""
+    """Map a file into memory for reading; an empty file is an error."""
     with path.open("rb") as file:
         if not os.fstat(file.fileno()).st_size:
             raise InputError(f"{path} is empty: copy or build it again.")

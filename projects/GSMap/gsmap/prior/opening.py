@@ -1,4 +1,4 @@
-"""Files of priors of all kinds."""
+"""Opening of the files of all kinds of priors."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ AnyPrior = MapPrior | GaussianPrior | ElementPrior
 
 
 def open_prior(path: str | Path, update: bool = False) -> AnyPrior:
-    """Open the file of a prior, whose first bytes tell its kind.
+    """Open the file of a prior. The first bytes of the file determine the kind of prior.
 
     Args:
         path: File that `MapPrior.save`, `GaussianPrior.save` or `ElementPrior.save` has written. It
@@ -20,10 +20,10 @@ def open_prior(path: str | Path, update: bool = False) -> AnyPrior:
         update: Reserve the file of a `MapPrior` for this process, to save it later.
 
     Returns:
-        The prior. `MapPrior.close` releases its file; the other kinds hold none.
+        The prior. `MapPrior.close` releases its file; other kinds of priors reserve no file.
 
     Raises:
-        ValueError: If the file is no valid prior.
+        ValueError: If the file is not a valid prior.
         RuntimeError: If the file is reserved by another process.
     """
     path = Path(path)

@@ -1,4 +1,4 @@
-"""Map priors by place: maps that earlier drives have predicted."""
+"""Map priors of several places: maps of the predictions of earlier drives."""
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ class Place(NamedTuple):
     """Place of a frame in the world.
 
     Attributes:
-        token: Name of the sample.
+        token: Name of the frame's sample.
         name: Name of the town or map; empty if it is unknown.
         scene: Name of the scene.
         pose: Transform from the annotation frame to the world in metres. (4, 4)
@@ -41,11 +41,11 @@ class Place(NamedTuple):
         """Place of a sample, or None if its pose is unknown.
 
         Args:
-            meta: Metainfo with ``lidar2global`` and, as far as they are known, ``token``,
+            meta: Metainfo with ``lidar2global`` (4, 4) and, if they are known, ``token``,
                 ``map_name`` and ``scene``.
 
         Raises:
-            ValueError: If the pose is no rigid motion.
+            ValueError: If the pose is not a rigid motion.
         """
         if meta.get("lidar2global") is None:
             return None
@@ -60,12 +60,12 @@ class Place(NamedTuple):
 
 
 class PlaceMaps:
-    """Map priors by place, which start empty.
+    """Map priors of towns or scenes, which are empty at first.
 
     Args:
         classes: Names of the classes.
         grid: Extent and cells of the window of a frame, the part of a map that is read and written.
-        rule: Rule by which the raster of a frame changes a map; by default the rule of `MapPrior`.
+        rule: Rule by which the raster of a frame changes a map; None for the default of `MapPrior`.
         memory: ``"kept"``: one map for all frames in a town (`Place.name`), or for each scene if
             the town is unknown. ``"scene"``: one map for each scene. ``"none"``: nothing is
             written.
@@ -74,7 +74,7 @@ class PlaceMaps:
         memories: Valid values of ``memory``.
 
     Raises:
-        ValueError: If ``memory`` is unknown, or the cells are no squares.
+        ValueError: If ``memory`` is unknown, or the cells are not square.
     """
 
     memories: ClassVar[tuple[str, ...]] = ("kept", "scene", "none")
@@ -110,7 +110,7 @@ class PlaceMaps:
         return self._priors.get(self._key(place))
 
     def find_or_create(self, place: Place) -> AnyPrior:
-        """Map at a place, which is created if there is none."""
+        """Map at a place. It is created if it does not exist."""
         key = self._key(place)
         if key not in self._priors:
             if self.memory == "scene" and len(self._priors) >= _MOST_SCENES:
@@ -121,7 +121,7 @@ class PlaceMaps:
         return self._priors[key]
 
     def _key(self, place: Place) -> str:
-        """Name of the map of a place."""
+        """Name of the map for a place: the town, or the scene."""
         if self.memory == "scene" or not place.name:
             return f"{place.name} scene {place.scene}"
         return place.name
@@ -144,7 +144,7 @@ class PlaceMaps:
         return prior.read(place.pose, self.grid)
 
     def write(self, place: Place | None, raster: Tensor) -> None:
-        """Write the rasterized prediction of a frame. A frame of unknown place is not written.
+        """Write the rasterized prediction of a frame; do nothing if the place is unknown.
 
         Args:
             place: Place of the frame; None if it is unknown.
@@ -166,8 +166,8 @@ class GivenMaps(PlaceMaps):
         update: Write each frame after it is predicted.
 
     Raises:
-        ValueError: If a prior has other classes or cells, two are of one town, or a prior that is
-            no `MapPrior` is to be written.
+        ValueError: If there is no prior, a prior has other classes or cells, two priors are of one
+            town, or ``update`` is True and a prior is not a `MapPrior`.
     """
 
     def __init__(
@@ -203,7 +203,7 @@ class GivenMaps(PlaceMaps):
         return self
 
     def find(self, place: Place) -> AnyPrior:
-        """Map at a place. If there is a single map, frames without the name of a place get it.
+        """Map at a place. If there is a single map, it is also used for frames of unknown towns.
 
         Raises:
             ValueError: If there is no map of the place.
@@ -226,7 +226,7 @@ class GivenMaps(PlaceMaps):
         """Return the place of a frame.
 
         Raises:
-            ValueError: If it is unknown.
+            ValueError: If the place is unknown.
         """
         if place is None:
             raise InputError(

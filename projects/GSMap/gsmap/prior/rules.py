@@ -14,9 +14,10 @@ States = NDArray[np.uint8]
 
 
 class WriteRule:
-    """Update of the cells in view, and conversion of their states to values in [0, 1].
+    """Rule that updates the cells in view and converts their states to values in [0, 1].
 
-    A subclass is a dataclass whose fields are numbers, which the file of a prior stores.
+    A subclass is a dataclass whose fields are numbers; the file of a prior stores them. In the
+    shapes below, C is the number of map classes and n the number of cells.
 
     Attributes:
         num_states: Number S of stored numbers (uint8) per cell and class.
@@ -47,7 +48,7 @@ class WriteRule:
 class KeepMaximum(WriteRule):
     """Largest prediction so far, in steps of 1 / 255: the rule of HRMapNet's training.
 
-    Cells never decrease. Predictions are rounded down, as in HRMapNet's public code.
+    The value of a cell never decreases. Predictions are rounded down, as in HRMapNet's public code.
     """
 
     def update(self, states: States, values: Floats) -> States:
@@ -97,7 +98,7 @@ class LastSeen(WriteRule):
         new = np.maximum(states, raised[None])
         # As in HRMapNet's public code, a p so small that 100 + 30 p is rounded to 100 is a miss.
         is_miss = raised[None] <= self.empty
-        new -= is_miss  # subtracts 1: a lower cell, which the maximum has set to 100, becomes 99
+        new -= is_miss  # subtracts 1; a lower cell is 100 after the maximum and becomes 99
         return np.clip(new, self.lowest, self.highest).astype(np.uint8)
 
     def read(self, states: States) -> Floats:
@@ -118,8 +119,8 @@ class HitMissCounts(WriteRule):
 
     Args:
         decay: Factor of older counts at each view, in [0.5, 0.98].
-        prior_count: Pseudo-count of misses, in [0.01, 100]: a single hit has the value
-            1 / (1 + prior_count).
+        prior_count: Number of misses that is added in the value, in [0.01, 100]. A cell with a
+            single hit has the value 1 / (1 + prior_count).
 
     Raises:
         ValueError: If a setting is out of range.
@@ -145,7 +146,8 @@ class HitMissCounts(WriteRule):
         added = np.stack([values, 1 - values])
         counts = states * np.float32(self.decay)
         counts += self._unit * added
-        counts += np.float32(0.5) * (added > 0)  # rounds to nearest: `astype` rounds down
+        # `astype` rounds down. With 0.5 added, it rounds to the nearest integer.
+        counts += np.float32(0.5) * (added > 0)
         return counts.astype(np.uint8)
 
     def read(self, states: States) -> Floats:

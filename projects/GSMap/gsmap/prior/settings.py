@@ -15,10 +15,11 @@ class PriorSettings:
     """Classes, global frame and cells of a map prior.
 
     Args:
-        classes: Names of the classes, one channel each.
-        place: Name of the global frame: the city or map in which poses are metres.
+        classes: Names of the classes. Each class is a channel of the prior.
+        place: Name of the global frame of the poses, such as the name of a city or a map.
         cell_m: Side of a cell in metres, in [0.01, 10].
-        tile_m: Side of a tile in metres, a multiple of ``cell_m`` of at most 1024 cells.
+        tile_m: Side of a tile (square of cells) in metres: a multiple of ``cell_m``, at most 1024
+            cells.
 
     Raises:
         ValueError: If a value is invalid.
@@ -56,7 +57,7 @@ class PriorSettings:
         return round(self.tile_m / self.cell_m)
 
     def require_equal(self, other: "PriorSettings", where: str) -> None:
-        """Require that the settings of a file are these settings.
+        """Check that the settings of a file are equal to these settings.
 
         Args:
             other: Settings of the file.
@@ -76,7 +77,7 @@ class PriorSettings:
 
 
 def _require_name(name: Any) -> None:
-    """Require a printable name of moderate length."""
+    """Check that a value is a printable name of 1 to 200 letters."""
     if not isinstance(name, str) or not name.isprintable() or not 1 <= len(name) <= _LONGEST_NAME:
         raise InputError(
             f"classes and place must be printable names of 1 to {_LONGEST_NAME} letters."
@@ -84,6 +85,6 @@ def _require_name(name: Any) -> None:
 
 
 def _require_number(name: str, value: Any) -> None:
-    """Require a number that is no truth value."""
+    """Check that a value is a number; True and False are not numbers here."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{name} must be a number.")

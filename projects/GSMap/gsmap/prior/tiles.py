@@ -17,16 +17,16 @@ from gsmap.utils.errors import WorkError
 
 Tile = NDArray[np.uint8]
 _LEVEL = 1  # compression level of zlib; higher levels save little on sparse rasters
-# After this number of bytes was read from a mapped file, its pages are released from memory, which
-# a large file would fill otherwise.
+# Each time this number of bytes has been read from a mapped file, its pages are released from
+# memory. Otherwise a large file would fill the memory.
 _MAPPED_BYTES = 32 << 20
-# The temporary file is written again without replaced tiles if they take more bytes than this, and
-# more bytes than the other tiles.
+# Old versions of tiles in the temporary file are removed once they take more bytes than this, and
+# more bytes than the current tiles.
 _WASTED_BYTES = 64 << 20
 
 
 class TileStore:
-    """Tiles by their column and row in the global frame (`TileKey`), with a limit of memory.
+    """Tiles by their column and row in the global frame (`TileKey`), with a memory limit.
 
     A tile is an array of cell states, whose meaning the rule of the prior defines. When the limit
     is reached, the least recently used tile leaves memory. If it has changed since it was read, it
@@ -52,7 +52,8 @@ class TileStore:
     def open(self, mapped: mmap.mmap, path: Path, entries: dict[TileKey, TileEntry]) -> None:
         """Read tiles from a file from now on.
 
-        The tiles in memory stay. So the store must be empty, or the file must hold its content.
+        Tiles in memory are not read again. So the store must be empty, or the file must contain all
+        of its tiles in their current state.
 
         Args:
             mapped: Content of the file.
@@ -68,7 +69,7 @@ class TileStore:
         self._spill.clear()
 
     def keys(self) -> set[TileKey]:
-        """Columns and rows of all tiles, in memory or not."""
+        """Columns and rows of all tiles, in memory and in files."""
         return {*self._file_entries, *self._spill.entries, *self._tiles}
 
     @property
@@ -119,10 +120,11 @@ class TileStore:
             self._mapped = None
 
     def _packed(self, key: TileKey) -> bytes:
-        """Compressed states of a tile; a damaged tile raises an error instead of being copied."""
+        """Compressed states of a tile. A damaged tile of a file raises an error."""
         if key in self._changed:
             return zlib.compress(self._tiles[key].tobytes(), level=_LEVEL)
         content, crc = self._stored(key)
+        # Only a check: it raises an error if the tile is damaged.
         unpack_tile(content, crc=crc, num_bytes=self._tile_bytes, path=self._path)
         return content
 
@@ -160,17 +162,17 @@ class TileStore:
 
 
 class _SpillFile:
-    """Temporary file of compressed tiles, without a name, which the system removes."""
+    """Temporary file of compressed tiles. It has no name, so the system removes it when closed."""
 
     def __init__(self) -> None:
         self.entries: dict[TileKey, TileEntry] = {}
         self._file: IO[bytes] | None = None
         self._end = 0  # size of the file in bytes
-        self._used_bytes = 0  # size of the current tiles in it, without replaced ones
+        self._used_bytes = 0  # bytes of current tiles in the file, without replaced tiles
         self._process = os.getpid()
 
     def write(self, key: TileKey, content: bytes) -> None:
-        """Write a tile; a later one replaces it."""
+        """Write a tile, which replaces an earlier version of the tile."""
         self._require_process()
         replaced_bytes = self._end - self._used_bytes
         if replaced_bytes > max(_WASTED_BYTES, self._used_bytes):
@@ -200,8 +202,8 @@ class _SpillFile:
     def _require_process(self) -> None:
         """Raise an error in a forked process.
 
-        It shares the position in the file with the process that made the file, so a read in one
-        process would move the position in both.
+        A forked process shares the position in the file with the process that made the file, so a
+        read in one process would move the position in both.
         """
         if self._process != os.getpid():
             raise WorkError(

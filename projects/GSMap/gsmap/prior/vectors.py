@@ -21,7 +21,7 @@ _MOST_PIECES = 1_000_000  # largest number of pieces of lines and areas, in all 
 _CHUNK = 64  # pieces of a tile that are drawn at a time
 _FARTHEST_M = 1e7  # largest coordinate of a vertex
 Piece = tuple[int, bool, FloatArray]
-"""Label, whether it is filled, and vertices."""
+"""Class index, whether the piece is a filled area, and vertices in metres (n, 2)."""
 
 
 def covered_cells(
@@ -29,7 +29,7 @@ def covered_cells(
 ) -> Iterator[tuple[TileKey, NDArray[np.bool_]]]:
     """Iterate over the tiles that a map touches, each with the cells that it covers.
 
-    Closed elements of `AREA_CLASSES` are filled. A cell is covered if half of its area is.
+    Closed elements of `AREA_CLASSES` are filled. A cell is covered if at least half of its area is.
 
     Args:
         elements: Map in the global frame, in metres.
@@ -37,8 +37,8 @@ def covered_cells(
         width_m: Width of a line in metres, > 0.
 
     Returns:
-        Column and row of each tile, and whether an element of a class covers a cell, (C,
-        tile_cells, tile_cells).
+        Column and row of each tile, and whether an element of each of the C classes covers each
+        cell, (C, tile_cells, tile_cells).
 
     Raises:
         ValueError: If a label or a vertex is out of range, or the map is too large.
@@ -83,14 +83,14 @@ def _pieces_by_tile(
             continue
         points = line[:, :2]
         is_area = settings.classes[label] in AREA_CLASSES and is_closed(points)
-        # Bound on the number of pieces, before any of them takes memory.
+        # Compute an upper bound of the number of pieces before any of them is created.
         if is_area:
-            # 2: the area may begin and end in the middle of a tile.
+            # Add 2, because the area may begin and end in the middle of a tile.
             tiles_along_axes = np.ptp(points, axis=0) / settings.tile_m + 2
             most_pieces = tiles_along_axes.prod()
         else:
-            # The line is cut into segments of a quarter of a tile, see below. Each of its vertices,
-            # which are added below, may begin a shorter segment.
+            # The line is cut into segments of a quarter of a tile. A shorter segment may begin at
+            # each vertex, so the number of vertices is added below.
             length_m = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
             most_pieces = length_m / settings.tile_m * 4
         num_pieces += int(most_pieces) + len(line)

@@ -15,7 +15,7 @@ from gsmap.structures.polylines import Points, resample
 from gsmap.utils.errors import InputError
 
 MAX_DEGREE = 5
-SAMPLES = 100  # points of a line and of a piece that a fit compares, both ends included
+SAMPLES = 100  # number of points of a line, and of a piece, that a fit compares, with both ends
 # Limit of the work of a search for joints, per vertex of the line. The work of a fit is the number
 # of points that it compares.
 _WORK = 2000
@@ -76,12 +76,17 @@ def curve_points(controls: Points, degree: int, num_points: int = SAMPLES) -> Fl
 
 @cache
 def _inverse(degree: int) -> Float:
-    """Matrix from points of a piece to its control points, by least squares. (degree + 1, 100)"""
+    """Matrix that computes a piece's control points from its points by least squares.
+
+    (degree + 1, SAMPLES)
+    """
     return np.linalg.pinv(bernstein(degree))
 
 
 def fit_piece(points: Points, degree: int) -> Float:
-    """Fit one piece to a line by least squares at equal arc lengths; the ends are the line's ends.
+    """Fit one piece to a line by least squares at points of equal arc distance.
+
+    The ends of the piece are then moved to the ends of the line.
 
     Args:
         points: Vertices in metres. (n >= 2, D)
@@ -100,12 +105,13 @@ def mean_deviation(line: Float, curve: Float, ignored_m: float = 0.05) -> float:
     """Compute the mean distance of a line and a curve, as in the public code of BeMapNet.
 
     Args:
-        line: Vertices of the line in metres, resampled to 100 points. (n, D)
+        line: Vertices of the line in metres, which is resampled to 100 points. (n, D)
         curve: Points of the curve in metres. (m, D)
-        ignored_m: Distances up to this one, in metres, count as 0.
+        ignored_m: Largest distance in metres that counts as 0.
 
     Returns:
-        Mean of the mean distances of both directions, in metres.
+        Average of the mean distance from the line to the curve and the mean distance from the curve
+        to the line, in metres.
     """
     from scipy.spatial import distance  # imported here: result files are read without scipy
 
@@ -120,7 +126,8 @@ def mean_deviation(line: Float, curve: Float, ignored_m: float = 0.05) -> float:
 def largest_deviation(line: Float, curve: Float) -> float:
     """Compute the largest distance of a line and a curve in the plane (Hausdorff distance).
 
-    Both directions count: points of the curve, and vertices and 100 equidistant points of the line.
+    It is the largest of two sets of distances: from the points of the curve to the line, and from
+    the vertices and 100 equidistant points of the line to the curve.
 
     Args:
         line: Vertices of the line in metres. (n, D)
@@ -132,12 +139,12 @@ def largest_deviation(line: Float, curve: Float) -> float:
     # Imported here: result files are read without numba.
     from gsmap.structures.curve_kernels import largest_deviation as compiled
 
-    # The search for the largest distance ends at ``enough``, here never.
+    # The search ends early at a distance of ``enough``. With infinity, it never ends early.
     return compiled(_in_plane(line), _in_plane(curve), num_points=SAMPLES, enough=np.inf)
 
 
 def _in_plane(points: Float) -> Float:
-    """Contiguous x and y of points. (n, D) -> (n, 2)"""
+    """Return x and y of points as a contiguous array. (n, D) -> (n, 2)"""
     return np.ascontiguousarray(points[:, :2], np.float64)
 
 
@@ -156,7 +163,7 @@ def _fit_test(degree: int, max_error_m: float, deviation: Deviation) -> Callable
     weights = bernstein(degree)
 
     def fits_compiled(part: Float) -> bool:
-        # The computation ends early when the error reaches ``enough``, as the piece does not fit.
+        # The computation ends early when the error reaches ``enough``: the piece does not fit then.
         error_m = deviation_of_fit(_in_plane(part), inverse, weights=weights, enough=max_error_m)
         return bool(error_m < max_error_m)
 
@@ -171,9 +178,9 @@ def fit_joints(
 ) -> list[int]:
     """Find the vertices of a line at which the pieces of its curve meet.
 
-    Each piece is as long as the error allows. The search has a limit of work, which long lines that
-    turn at each vertex can reach. It then continues by doubling the length of a piece as long as
-    the piece fits.
+    Each piece is as long as the error allows. The work of the search is limited. Long lines that
+    turn at each vertex can reach the limit. From there on, the length of each piece is doubled as
+    long as the piece fits.
 
     Args:
         points: Vertices in metres. (n >= 2, D)
@@ -205,7 +212,7 @@ def fit_joints(
             if fits(points[start : end + 1]):
                 break
             end -= 1
-        if work <= 0:  # the limit is reached: double the length instead
+        if work <= 0:  # the limit is reached, so the length is doubled instead
             end = start + 1
             farther = min(start + 2, last)
             while end < farther and fits(points[start : farther + 1]):
@@ -242,8 +249,8 @@ def fit_pieces(
 ) -> Float:
     """Fit a line with few pieces, each as long as the error allows.
 
-    Joints are vertices of the line (`fit_joints`). A piece between neighbouring vertices is exact,
-    so there is always a fit. The public code of BeMapNet uses ``deviation=mean_deviation``.
+    Pieces meet at vertices of the line (`fit_joints`). A piece between neighbouring vertices is
+    exact, so there is always a fit. The public code of BeMapNet uses ``deviation=mean_deviation``.
 
     Args:
         points: Vertices in metres. (n >= 2, D)

@@ -11,9 +11,9 @@ from gsmap.utils.errors import InputError
 NUM_CAN_BUS = 18
 OF_ONE_FRAME = slice(3, 17)  # entries of ``can_bus`` that need no earlier frame
 
-# Camera that is 1 km ahead of the vehicle and looks ahead. The whole range of the map is behind the
-# camera, and its frustum is out of range. So it contributes to no BEV cell, by projection or by
-# lifting.
+# Camera that is 1 km away from the vehicle along +y of the annotation frame and looks along +y. The
+# whole range of the map is behind the camera, and its frustum is out of range. So it contributes to
+# no BEV cell, neither by projection nor by lifting.
 OUT_OF_SIGHT = np.array(
     [[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, -1000.0], [0, 0, 0, 1.0]]
 )  # cam_from_frame
@@ -48,8 +48,8 @@ def calibration_arrays(
     * ``img_from_frame`` and its inverse ``frame_from_img``: between metres in the annotation frame
       and (u * d, v * d, d, 1), with pixels u, v of the image of the network and depth d in metres.
     * ``img_from_ground`` and its inverse ``ground_from_img``: as above, but z of the annotation
-      frame is replaced by the height above the plane z = 0 of the vehicle, the ground.
-    * ``cam_from_ground`` and ``ego_from_cam``: transforms in metres.
+      frame is replaced by the height above the ground, the plane z = 0 of the vehicle.
+    * ``cam_from_ground`` and ``ego_from_cam``: transforms in metres, with ground as above.
     * ``cam2img``, ``img_aug_matrix`` and ``can_bus``: fields of the metainfo. ``can_bus`` is
       processed by `without_history`, and zero if the sample lacks it.
 
@@ -103,17 +103,20 @@ def stack_calibration_arrays(
     """Stack the calibration arrays of the samples of a batch.
 
     Args:
-        metas: Metainfo of the samples, as in `calibration_arrays`. B in number.
+        metas: Metainfo of the B samples, as in `calibration_arrays`.
         names: Names of the arrays.
 
     Returns:
-        An array for each name, in their order. (B, ...)
+        One array for each name, in the order of the names. (B, ...)
 
     Raises:
         ValueError: If a sample lacks a field.
     """
     samples = [calibration_arrays(meta, names) for meta in metas]
-    return [np.stack([arrays[name] for arrays in samples]) for name in names]
+    batch_arrays = []
+    for name in names:
+        batch_arrays.append(np.stack([arrays[name] for arrays in samples]))
+    return batch_arrays
 
 
 def _frame_from_ground(ego_from_frame: NDArray[np.floating[Any]]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Distances of lines and their Bezier curves, compiled by numba for ``bezier``."""
+"""Distances between lines and Bezier curves fitted to them, compiled by numba for ``bezier``."""
 
 import math
 
@@ -54,9 +54,11 @@ def largest_distance(points: Float, line: Float, enough: float) -> float:
             along_y = line[s + 1, 1] - line[s, 1]
             to_x = x - line[s, 0]
             to_y = y - line[s, 1]
-            squared = along_x * along_x + along_y * along_y
+            squared_length = along_x * along_x + along_y * along_y
             # Position of the nearest point of the segment, from 0 at its start to 1 at its end.
-            share = (to_x * along_x + to_y * along_y) / squared if squared > 0.0 else 0.0
+            share = 0.0
+            if squared_length > 0.0:
+                share = (to_x * along_x + to_y * along_y) / squared_length
             share = min(max(share, 0.0), 1.0)
             off_x = to_x - share * along_x
             off_y = to_y - share * along_y
@@ -69,16 +71,17 @@ def largest_distance(points: Float, line: Float, enough: float) -> float:
 
 @njit(cache=True)
 def largest_deviation(line: Float, curve: Float, num_points: int, enough: float) -> float:
-    """Compute the largest distance of a line and a curve, in both directions.
+    """Compute the largest distance from a line to a curve, and from the curve to the line.
 
     Args:
         line: Vertices of the line in metres. (n, 2)
         curve: Points of the curve in metres. (m, 2)
-        num_points: Number of equidistant points of the line that count in addition to its vertices.
+        num_points: Number of equidistant points of the line that are measured in addition to its
+            vertices.
         enough: Distance in metres at which the search ends.
 
     Returns:
-        Largest distance in metres, or a distance of at least ``enough``.
+        Larger of both distances in metres, or a distance of at least ``enough``.
     """
     largest = largest_distance(resample_line(line, num_points), curve, enough=enough)
     if largest < enough:
@@ -90,7 +93,7 @@ def largest_deviation(line: Float, curve: Float, num_points: int, enough: float)
 
 @njit(cache=True)
 def deviation_of_fit(line: Float, inverse: Float, weights: Float, enough: float) -> float:
-    """Fit one Bezier curve to a line and compute the largest distance of both.
+    """Fit one Bezier curve to a line and compute the largest distance between the two.
 
     The curve is fitted by least squares to points at equal distances. The first and last control
     points are then moved to the ends of the line.

@@ -15,9 +15,10 @@ def cut_to_range(
     x_range: tuple[float, float],
     y_range: tuple[float, float],
 ) -> MapElements:
-    """Cut elements with the range of a frame, by the rules for ground truth.
+    """Cut elements to the range of a frame, by the rules for ground truth.
 
-    An area becomes the outlines of its parts in the range, and a line its parts in the range.
+    An area is replaced by the outlines of its parts in the range, and a line by its parts in the
+    range.
 
     Args:
         elements: Elements in the frame, (x, y) in metres.
@@ -26,7 +27,8 @@ def cut_to_range(
         y_range: Smallest and largest y of the range in metres.
 
     Returns:
-        Parts of the elements, in their order, with their scores (1 without scores).
+        Parts of the elements in the order of the elements. A part has the score of its element, or
+        1 if the elements have no scores.
     """
     import shapely  # imported here: most programs that use elements cut none
 
@@ -36,10 +38,11 @@ def cut_to_range(
     scores: list[float] = []
     for line, label, score in elements.rows:
         if classes[label] in AREA_CLASSES and len(line) >= _FEWEST_OF_RING:
-            area_in_range = shapely.make_valid(shapely.Polygon(line)) & box
+            polygon = shapely.make_valid(shapely.Polygon(line))
+            area_in_range = polygon & box
             pieces = []
             for area in shapely.get_parts(area_in_range):
-                if area.area > 0.0:
+                if area.area > 0.0:  # parts may also be points or lines
                     pieces.append(shapely.get_coordinates(area.exterior))
         else:
             pieces = clip_to_box(line, x_range, y_range)

@@ -147,7 +147,7 @@ class MapElements:
 
     @property
     def confidence(self) -> FloatArray:
-        """Scores, or ones without scores. (N,)"""
+        """Scores, or ones if there are no scores. (N,)"""
         return np.ones(len(self)) if self.scores is None else self.scores
 
     @property
@@ -156,10 +156,10 @@ class MapElements:
         return self.scales is not None and self.rotations is not None
 
     def with_coordinates(self, dim: int) -> "MapElements":
-        """Drop coordinates of the vertices.
+        """Keep only the first coordinates of the vertices.
 
         Args:
-            dim: Number of coordinates, from the first one, that remain.
+            dim: Number of coordinates to keep.
 
         Returns:
             Elements with ``dim`` coordinates per vertex.
@@ -179,8 +179,8 @@ class MapElements:
         """Transform the elements to another frame, by the position and yaw of a pose.
 
         Roll and pitch are ignored: at 30 m from the origin, they change x and y by centimetres.
-        Ground truth is cut out of a map by position and yaw, too, so this transform back to the
-        frame of the map restores the coordinates of the map.
+        Ground truth is also cut out of a map by position and yaw, so transforming it back to the
+        frame of the map by this method restores the coordinates of the map.
 
         Args:
             transform: Transform from the frame of the elements to the other one, in metres. (4, 4)
@@ -188,7 +188,7 @@ class MapElements:
         Returns:
             Elements in the other frame.
         """
-        axis_x, axis_y = transform[:2, 0]
+        axis_x, axis_y = transform[:2, 0]  # the x axis of the elements' frame in the other frame
         cos, sin = transform[:2, 0] / np.hypot(axis_x, axis_y)
         rotation = np.eye(self.points.shape[1])
         rotation[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -231,7 +231,7 @@ def _require(valid: BoolArray, offsets: IntArray, fault: str) -> None:
     Args:
         valid: Whether each vertex is valid. (M,)
         offsets: Index of the first vertex of each element, then M. (N + 1,)
-        fault: What an invalid vertex has, for the error message.
+        fault: Description of an invalid vertex. It ends the message "element i has a ...".
     """
     if not valid.all():
         first_invalid = valid.argmin()
@@ -261,7 +261,7 @@ def _concatenate(polylines: PerElement) -> FloatArray:
 
 
 def _per_vertex(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray | None:
-    """Concatenate values per vertex of all polylines and check their number."""
+    """Concatenate the values of the vertices of all polylines, and check the resulting shape."""
     if values is None:
         return None
     if not len(values):

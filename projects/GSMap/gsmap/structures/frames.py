@@ -1,4 +1,4 @@
-"""Axes of annotation frames and the ground plane in them, for displays."""
+"""Axes and ground planes of annotation frames, for displays."""
 
 from dataclasses import dataclass, replace
 
@@ -37,8 +37,9 @@ class FrameView:
         """
         if ego_from_frame is None:
             return self
-        # z of a point in the frame of the vehicle is a x + b y + c z + height. On the ground, it
-        # is ``ego_ground_z_m``; solved for z, this is the ground plane in the annotation frame.
+        # A point (x, y, z) of the annotation frame has the height a x + b y + c z + height in the
+        # frame of the vehicle. On the ground, this height is ``ego_ground_z_m``. Solved for z, the
+        # equation is the ground plane in the annotation frame.
         a, b, c, height = np.asarray(ego_from_frame)[2].tolist()
         return replace(self, ground=(-a / c, -b / c, (self.ego_ground_z_m - height) / c))
 
@@ -50,7 +51,7 @@ class FrameView:
 
     @property
     def display_turn_rad(self) -> float:
-        """Rotation of the display against the frame in radians, anticlockwise."""
+        """Rotation from the frame to the display in radians, anticlockwise."""
         return 0.0 if self.forward == "y" else np.pi / 2
 
     def lift(self, points: FloatArray) -> FloatArray:
@@ -84,10 +85,10 @@ def viewing_azimuth(img_from_frame: FloatArray, view: FrameView) -> float:
     return float(np.arctan2(-right, ahead))
 
 
-# "lidar" is the frame of the roof LiDAR of nuScenes, 1.84 m above the road; the origin of the
-# vehicle frame of nuScenes is on the road, hence the default of `ego_ground_z_m`. "ego" is the
-# vehicle frame of Argoverse 2; its origin is on the rear axle, 0.31 m above the road (median z of
-# map vertices within 8 m). The vehicles are a Renault Zoe (nuScenes) and a Ford Fusion.
+# "lidar" is the frame of the roof LiDAR of nuScenes, 1.84 m above the road. The vehicle frame of
+# nuScenes has its origin on the road, so `ego_ground_z_m` is 0, the default. "ego" is the vehicle
+# frame of Argoverse 2. Its origin is on the rear axle, 0.31 m above the road (median z of map
+# vertices within 8 m). The vehicles are a Renault Zoe (nuScenes) and a Ford Fusion (Argoverse 2).
 FRAME_VIEWS: dict[str, FrameView] = {
     "lidar": FrameView(forward="y", ground=(0.0, 0.0, -1.84), vehicle_m=(-1.59, 2.49, 1.73)),
     "ego": FrameView(

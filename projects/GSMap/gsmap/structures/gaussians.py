@@ -117,7 +117,7 @@ class GaussianSpace:
         return Gaussians(means, scales, rotations=reference[..., -1] + self.heading_rad)
 
     def scales(self, raw: Tensor) -> Tensor:
-        """Apply the activation of sigma; zero gives ``init_scales_m``. (..., 2) -> (..., 2) m"""
+        """Apply the activation to get sigma in metres; zero gives ``init_scales_m``. (..., 2)"""
         shifted = raw + constant(raw, self._start)
         if self.activation == "sigmoid":
             span = constant(raw, self.max_scale_m - self.min_scale_m)
@@ -141,7 +141,7 @@ class GaussianSpace:
 
         Args:
             gaussians: Gaussians. (...)
-            like: References whose heights, if any, are copied. (..., D)
+            like: References whose heights, if they have any, are copied to the result. (..., D)
 
         Returns:
             References, differentiable. (..., D)
@@ -346,12 +346,12 @@ def fuse_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
 def gaussians_along(points: Tensor, across_m: float) -> Gaussians:
     """Create Gaussians that cover lines.
 
-    Sigma along a line is half the mean distance of a point from its neighbours.
+    The sigma of a point along its line is half the mean distance to its neighbours, at least
+    ``across_m``.
 
     Args:
         points: Ordered centres in metres. (..., P, 2)
-        across_m: Standard deviation across the line, and the smallest standard deviation along the
-            line, in metres.
+        across_m: Standard deviation across the line in metres.
 
     Returns:
         Gaussians. (..., P)
@@ -381,8 +381,9 @@ def _rotation_matrices(angles: Tensor) -> Tensor:
 def extents_along_line(gaussians: Gaussians) -> Tensor:
     r"""Compute the standard deviations of Gaussians along and across the line of their centres.
 
-    A standard deviation is :math:`\sqrt{d^T \Sigma d}`. The direction d of the line at a centre
-    joins both neighbours, or the end of the line and its neighbour.
+    A standard deviation is :math:`\sqrt{d^T \Sigma d}` for a unit vector d along or across the
+    line. The direction of the line at a centre is the direction from the previous centre to the
+    next one; at an end of the line, the centre itself replaces the missing one.
 
     Args:
         gaussians: Gaussians of each line, two or more. (..., P)
@@ -391,11 +392,11 @@ def extents_along_line(gaussians: Gaussians) -> Tensor:
         Standard deviations along and across the line, in metres. (..., P, 2)
     """
     angles = angles_of_line(gaussians.means) - gaussians.rotations
-    cos = angles.cos().square()
-    sin = angles.sin().square()
-    first, second = gaussians.scales.square().unbind(-1)
-    along = first * cos + second * sin
-    across = first * sin + second * cos
+    cos_squared = angles.cos().square()
+    sin_squared = angles.sin().square()
+    first, second = gaussians.scales.square().unbind(-1)  # variances along the Gaussian's axes
+    along = first * cos_squared + second * sin_squared
+    across = first * sin_squared + second * cos_squared
     return torch.stack([along, across], dim=-1).sqrt()
 
 

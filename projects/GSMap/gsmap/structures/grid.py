@@ -28,7 +28,8 @@ class BEVGrid:
         y_range: Smallest and largest y in metres.
         height: Number H of rows, along y.
         width: Number W of columns, along x.
-        forward: Axis of the direction of travel, ``"x"`` or ``"y"``; None for the longer side.
+        forward: Axis of the direction of travel, ``"x"`` or ``"y"``; None selects the axis of the
+            longer side, and y for a square.
 
     Raises:
         ValueError: If a range is empty, a size is not positive or ``forward`` is unknown.
@@ -120,8 +121,8 @@ class BEVGrid:
             points: Points (x, y) in metres. (..., 2)
 
         Returns:
-            Distance from the front edge, 1 at the rear edge, and distance from the left
-            edge, 1 at the right edge. (..., 2)
+            Distance from the front edge (0 there, 1 at the rear edge), and distance from the left
+            edge (0 there, 1 at the right edge). (..., 2)
         """
         order, scale, shift = self._front_axes
         coordinates = _reorder(self.norm_from_metres(points), order)
@@ -131,8 +132,8 @@ class BEVGrid:
         """Convert relative distances from the front and from the left edge to metres.
 
         Args:
-            points: Distance from the front edge, 1 at the rear edge, and distance from the left
-                edge, 1 at the right edge. (..., 2)
+            points: Distance from the front edge (0 there, 1 at the rear edge), and distance from
+                the left edge (0 there, 1 at the right edge). (..., 2)
 
         Returns:
             Points (x, y) in metres. (..., 2)
@@ -145,8 +146,8 @@ class BEVGrid:
     def _front_axes(self) -> tuple[list[int], tuple[float, float], tuple[float, float]]:
         """Order of the axes, scale and shift that `front_from_metres` applies to [0, 1].
 
-        An exchange of the axes and t -> 1 - t are their own inverses, so `metres_from_front`
-        applies the same steps, in the reverse order.
+        Exchanging the axes twice changes nothing, and neither does t -> 1 - t applied twice.
+        Therefore `metres_from_front` applies the same steps in the reverse order.
         """
         if self.forward == "x":
             return [0, 1], (-1, -1), (1, 1)
@@ -186,7 +187,7 @@ def _reorder(points: Array, order: list[int]) -> Array:
         return points[..., order]
     import torch
 
-    # Indexing by ``order`` would copy it to the GPU and wait.
+    # Indexing by the list ``order`` would copy the list to the GPU and wait for the copy.
     return torch.stack([points[..., axis] for axis in order], dim=-1)
 
 

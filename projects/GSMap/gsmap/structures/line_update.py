@@ -1,4 +1,4 @@
-"""Kalman update of predicted lines, whose points are Gaussians, by lines of previous frames."""
+"""Kalman update of predicted lines by lines of previous frames. The points are Gaussians."""
 
 from typing import NamedTuple
 
@@ -7,18 +7,18 @@ from torch import Tensor
 
 from gsmap.structures.gaussians import Gaussians, covariances, with_covariances
 
-# Smallest divisor, in square metres: a segment of length 0 gives a share of 0 instead of NaN.
+# Smallest divisor, in square metres. With it, a segment of length 0 has the share 0 and not NaN.
 _MIN_SQUARED_LENGTH = 1e-9
 
 
 class LinePlaces(NamedTuple):
-    """Nearest places on lines to points, for K pairs of an element and a line.
+    """For each point of an element, the nearest place on a line, for K pairs of both.
 
     Attributes:
         distances: Distance of each point from its place, in metres. (K, P)
-        segments: Index of the segment of the place. (K, P)
+        segments: Index of the segment of the line on which the place lies. (K, P)
         shares: Position of the place on its segment, in [0, 1]. (K, P)
-        beside: Whether the point lies beside the line, not beyond one of its ends. (K, P)
+        beside: Whether the point lies beside the line, and not beyond one of its ends. (K, P)
     """
 
     distances: Tensor
@@ -28,17 +28,17 @@ class LinePlaces(NamedTuple):
 
 
 def nearest_places(points: Tensor, lines: Tensor) -> LinePlaces:
-    """Find the nearest places on lines to points, pair by pair.
+    """Find the nearest place on a line for each point of an element, in K pairs of both.
 
     Args:
-        points: Points of each element in metres. (K, P, 2)
-        lines: Vertices of each line in metres. (K, Q, 2)
+        points: Points of the element of each pair, in metres. (K, P, 2)
+        lines: Vertices of the line of each pair, in metres. (K, Q, 2)
 
     Returns:
         Nearest places. (K, P)
     """
-    points = points.mT.contiguous()  # (K, 2, P): the longest axis is the last one
-    lines = lines.mT.contiguous()
+    points = points.mT.contiguous()  # (K, 2, P), with the longest axis last
+    lines = lines.mT.contiguous()  # (K, 2, Q)
     starts = lines[:, :, None, :-1]
     steps = lines.diff(dim=-1)[:, :, None]
     offsets = points[..., None] - starts  # (K, 2, P, Q - 1)
@@ -71,13 +71,13 @@ def _candidate_pairs(
 def update_from_known_lines(
     now: Gaussians, labels: Tensor, known: Gaussians, known_labels: Tensor, gate_m: float
 ) -> Gaussians:
-    r"""Update the Gaussians of elements across the known lines that they belong to.
+    r"""Update the Gaussians of elements by the known lines that they belong to.
 
     An element belongs to the nearest known line of its class, by the mean distance of the points
-    that lie beside the line. The line determines the position of a point across it but not along
-    it, since the spacing of points differs between frames. With the normal n at the nearest place c
-    on the line and the variance :math:`v = n^T \Sigma_c n` there, a Kalman update in one direction
-    gives
+    that lie beside the line. The update moves a point across the line, but not along it, because
+    the spacing of points differs between frames. With the normal n of the line at the nearest place
+    c on the line, and the variance :math:`v = n^T \Sigma_c n` there, the Kalman update in this
+    direction is
 
     .. math:: k = \Sigma n / (n^T \Sigma n + v), \quad \mu' = \mu + k\, n^T (c - \mu), \quad
               \Sigma' = \Sigma - k n^T \Sigma
@@ -87,10 +87,11 @@ def update_from_known_lines(
         labels: Classes of the elements. (N,)
         known: Gaussians of M known lines in the current frame. (M, Q)
         known_labels: Classes of the known lines. (M,)
-        gate_m: Largest distance in metres of an element, and of a point, from its line.
+        gate_m: Distance in metres. Elements and points that are this far from their line, or
+            farther, are not updated.
 
     Returns:
-        Gaussians of the elements. (N, P)
+        Updated Gaussians of the elements. (N, P)
     """
     rows, cols = _candidate_pairs(
         now, labels, known=known, known_labels=known_labels, gate_m=gate_m
@@ -99,15 +100,16 @@ def update_from_known_lines(
         return now
     places = nearest_places(now.means[rows], known.means[cols])
     num_beside = places.beside.sum(-1)
-    means_of_pairs = (places.distances * places.beside).sum(-1) / num_beside.clamp(min=1)  # (K,)
-    is_far = (num_beside < 2) | (means_of_pairs >= gate_m)
-    mean_distances = means_of_pairs.new_full((len(labels), len(known_labels)), torch.inf)  # (N, M)
-    mean_distances[rows, cols] = means_of_pairs.masked_fill(is_far, torch.inf)
-    # Index of the pair of each element and line among the K pairs. (N, M)
+    # Mean distance of the points beside the line, for each pair. (K,)
+    pair_distances = (places.distances * places.beside).sum(-1) / num_beside.clamp(min=1)
+    is_far = (num_beside < 2) | (pair_distances >= gate_m)
+    mean_distances = pair_distances.new_full((len(labels), len(known_labels)), torch.inf)  # (N, M)
+    mean_distances[rows, cols] = pair_distances.masked_fill(is_far, torch.inf)
+    # For each element and line, the index of their pair among the K pairs. (N, M)
     pairs = torch.zeros_like(mean_distances, dtype=torch.long)
     pairs[rows, cols] = torch.arange(len(rows), device=rows.device)
-    # Nearest line of each element, and the pair of both. An element without a line gets any pair;
-    # its smallest mean is infinite, so `belongs` leaves it unchanged.
+    # Nearest line of each element, and the pair of both. An element without a line gets some pair,
+    # but its smallest mean is infinite, so `belongs` is False and it is not changed.
     smallest_mean, line = mean_distances.min(1)
     pair = pairs.gather(1, line[:, None])[:, 0]
     point_distances = places.distances[pair]  # (N, P)
@@ -133,7 +135,7 @@ def update_from_known_lines(
     updated = with_covariances(means, covariance - gain @ toward.mT, near=now.rotations)
     belongs = (smallest_mean < gate_m)[:, None]
     is_updated = belongs & places.beside[pair] & (point_distances < gate_m)  # (N, P)
-    # The direction has length 1, or 0 for a segment without length, across which nothing is known.
+    # The direction has length 1. For a segment of length 0 it has length 0, and there is no normal.
     is_updated &= along.norm(dim=-1) > 0.5
     return Gaussians(
         means=torch.where(is_updated[..., None], updated.means, now.means),

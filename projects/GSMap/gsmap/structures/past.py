@@ -1,4 +1,4 @@
-"""Temporal memory of a batch: the tensors that the previous frames left, and the motion since."""
+"""Temporal memory of a batch: tensors of the previous frames, and the motion since then."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Past:
-    """Memory that the previous frames left, and the motion of the vehicle since then.
+    """Memory of the previous frames, and the motion of the vehicle since then.
 
     Args:
         memory: Tensors by name, without gradient; zeros for a stream that starts, and empty if all

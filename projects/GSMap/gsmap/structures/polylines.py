@@ -12,11 +12,11 @@ from gsmap.utils.errors import InputError
 Points = NDArray[np.floating[Any]]
 
 PADDING = -10000.0
-"""Value of the unused rows of ``equivalent_orders``."""
+"""Value of the unused rows of ``equivalent_orders`` and ``sampled_orders``."""
 
 
 def _check_polyline(points: Points, num_points: int = 2) -> Points:
-    """Convert a polyline (n, D) to float64; ValueError if a shape or ``num_points`` is wrong."""
+    """Check a polyline (n, D) and ``num_points``, and convert the polyline to float64."""
     points = np.asarray(points)
     if points.ndim != 2 or len(points) < 2 or points.shape[1] < 2:
         raise InputError(f"points must have shape (n >= 2, 2 or 3), got {points.shape}.")
@@ -33,9 +33,9 @@ def is_closed(points: Points) -> bool:
 def arc_lengths(points: Points) -> NDArray[np.float64]:
     """Compute the distance along a polyline from its first point to each point, in the plane.
 
-    Heights do not count. The released code of the published methods resamples lines by shapely,
-    which ignores heights as well. So a line with z and its projection to the plane are resampled at
-    equal (x, y).
+    Heights are ignored, so a line with z and its projection to the plane are resampled at equal
+    (x, y). The released code of the published methods resamples lines by shapely, which ignores
+    heights as well.
 
     Args:
         points: Vertices in metres. (n, D)
@@ -88,9 +88,9 @@ def pad_lines(
 def parts_inside(
     points: Points, x_range: tuple[float, float], y_range: tuple[float, float]
 ) -> list[NDArray[np.float64]]:
-    """Cut a line with a rectangle by shapely.
+    """Compute the parts of a line inside a rectangle by shapely.
 
-    Unlike in `clip_to_box`, a line that crosses itself is cut at the crossing.
+    Unlike in `clip_to_box`, a line that crosses itself is also cut at the crossing.
 
     Args:
         points: Vertices in metres; a line of fewer than two has no parts. (n, 2)
@@ -152,8 +152,8 @@ def resample_all(
     # All polylines get the length n of the longest: the last vertex is repeated.
     place = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # in the polyline, (N, n)
     vertex = place + offsets[:-1, None]  # row of `points`
-    # Without vertices, the place is -1, and the row is that of another polyline or -1. The row may
-    # be any valid one, because such a polyline keeps its zeros below.
+    # In a polyline without vertices, the place is -1, and the row is -1 or belongs to another
+    # polyline. Any valid row will do, because the result of this polyline stays zero below.
     vertices = points[vertex.clip(0)]  # (N, n, D)
     steps = np.linalg.norm(np.diff(vertices[..., :2], axis=1), axis=-1)
     along = np.zeros(vertex.shape)
@@ -215,8 +215,8 @@ def equivalent_orders(
 def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
     """Compute the point orders of a resampled line, with both directions at each point.
 
-    An open line has two orders: forward and reversed. A closed line has two orders for each of its
-    P - 1 different points, which start there: forward and reversed. It is not resampled again.
+    An open line has two orders: forward and reversed. A closed line has P - 1 different points. A
+    forward and a reversed order start at each of them. The line is not resampled again.
 
     Args:
         points: Points in metres; the last equals the first if closed. (P, D)
@@ -241,9 +241,9 @@ def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
 def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int64]:
     """Reorder the points of lines so that the path through them is short (2-opt, Croes 1958).
 
-    The part of a line whose reversal shortens the line most is reversed, until no reversal shortens
-    the line. This straightens a line that runs back and forth. A line whose ends are closer than
-    its mean step, nearly a ring, keeps its ends.
+    In each step, the part of a line whose reversal shortens the line most is reversed, until no
+    reversal shortens it. This straightens a line that runs back and forth. If the ends of a line
+    are closer than its mean step, so that it is nearly a ring, the ends do not change.
 
     Args:
         lines: Points of each line in metres; lengths are measured in the plane. (M, P, 2 or 3)
@@ -313,7 +313,7 @@ def clamp(points: Points, x_range: tuple[float, float], y_range: tuple[float, fl
 def clip_to_box(
     points: Points, x_range: tuple[float, float], y_range: tuple[float, float]
 ) -> list[NDArray[np.float64]]:
-    """Cut a polyline with an axis-aligned rectangle (Liang and Barsky, 1984).
+    """Compute the pieces of a polyline in an axis-aligned rectangle (Liang and Barsky, 1984).
 
     Pieces keep the direction of the polyline, and further coordinates are interpolated. A ring is
     cut into open pieces; its arbitrary start does not end a piece. Pieces that only touch the
@@ -343,7 +343,8 @@ def clip_to_box(
     # A segment on the line of an edge gives 0 / 0. Such an edge does not cut it.
     along_edge = (step[:, :2] == 0) & np.isnan(cuts)
     cuts = np.where(along_edge, [[[-np.inf]], [[np.inf]]], cuts)
-    # Shares in [0, 1] of a segment at which it enters and leaves; enter > leave if it misses.
+    # Shares in [0, 1] of a segment at which it enters and leaves the rectangle. A segment that
+    # misses the rectangle has enter >= leave.
     enter = cuts.min(0).max(-1).clip(min=0)
     leave = cuts.max(0).min(-1).clip(max=1)
     hits = np.flatnonzero(enter < leave)

@@ -10,7 +10,7 @@ from gsmap.utils.errors import InputError
 
 
 def rigid(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> NDArray[np.float64]:
-    """Combine a rotation and a translation. (3, 3), (3,) -> (4, 4)"""
+    """Combine a rotation and a translation to a rigid transform. (3, 3), (3,) -> (4, 4)"""
     transform = np.eye(4)
     transform[:3, :3] = rotation
     transform[:3, 3] = translation
@@ -48,7 +48,7 @@ def is_rigid(transform: NDArray[np.floating[Any]], tolerance: float = 1e-3) -> N
 
     Args:
         transform: Matrices. (..., 4, 4)
-        tolerance: Largest error of the products of rows of a rotation.
+        tolerance: Largest error of the dot and cross products of the rows of a rotation.
 
     Returns:
         Whether a matrix is rigid. (...)

@@ -136,13 +136,15 @@ class Slots:
 
 
 class Scenes:
-    """Streams by the name of their scene, for testing; frames of a scene must come in order.
+    """Streams by the name of their scene, for testing. Frames of a scene must come in order.
 
-    A copy, for example by pickle, continues with any model of equal name (``str(model)``).
+    The streams are bound to one model (`claim`). A copy, for example by pickle, can be continued by
+    any model of equal name (``str(model)``).
 
     Args:
         max_gap_s: Longest time between two frames of a stream in seconds.
-        max_streams: Largest number of streams; the stream that has waited longest is dropped.
+        max_streams: Largest number of streams. Beyond it, the stream that has received no frame for
+            the longest time is dropped.
     """
 
     def __init__(self, max_gap_s: float, max_streams: int = 16) -> None:
@@ -190,20 +192,20 @@ class Scenes:
                 frame of its scene.
         """
         states: list[StreamState | None] = []
-        batch: dict[str, Frame] = {}
+        frame_of_scene: dict[str, Frame] = {}
         for frame in frames:
-            if frame.scene in batch:
+            if frame.scene in frame_of_scene:
                 raise InputError(
-                    f"frames {batch[frame.scene]} and {frame} of one scene are in one batch, but "
-                    "the later one needs the memory of the earlier one: set batch_size=1 or use "
-                    "StreamBatches."
+                    f"frames {frame_of_scene[frame.scene]} and {frame} of one scene are in one "
+                    "batch, but the later one needs the memory of the earlier one: set "
+                    "batch_size=1 or use StreamBatches."
                 )
-            batch[frame.scene] = frame
+            frame_of_scene[frame.scene] = frame
             states.append(self._previous_state(frame))
         return states
 
     def _previous_state(self, frame: Frame) -> StreamState | None:
-        """State that a frame continues, or None; ValueError if the frame is not later."""
+        """Look up the state that a frame continues; raise ValueError if the frame is not later."""
         state = self.states.get(frame.scene)
         if state is None:
             return None

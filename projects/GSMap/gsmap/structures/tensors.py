@@ -13,7 +13,7 @@ from torch._subclasses import FakeTensor
 from gsmap.utils.errors import InputError
 
 _ALIGNMENT = 64  # bytes, at least the alignment that any type or kernel needs
-_LARGE = 2**20  # bytes from which a tensor is copied separately
+_LARGE = 2**20  # bytes; tensors of this size or more are copied separately
 _MOST_CONSTANTS = 4096  # per process; further constants are not cached
 _constants: dict[Hashable, Tensor] = {}
 _Params = ParamSpec("_Params")
@@ -128,7 +128,7 @@ def upload(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
 
 
 class LateValues:
-    """Copy of a tensor on the host that is awaited only when it is read.
+    """Copy of a tensor to the host, which runs in the background until `read` waits for it.
 
     Args:
         values: Tensor of any shape on any device.
@@ -163,7 +163,7 @@ def _hashable(values: Any) -> Any:
 
 
 def at_least_float32(values: Tensor) -> Tensor:
-    """Convert half-precision values, too coarse for coordinates, to float32; keep other types."""
+    """Convert half precision, which is too coarse for coordinates, to float32; keep other types."""
     return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
@@ -218,13 +218,16 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
 
 
 def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
-    """Address and version of each tensor of a module, to find out whether its values have changed.
+    """Address and version of each tensor of a module, to detect changes of its values.
 
     A change in place raises the version of a tensor. Tensors that were made in inference mode have
     no version, and get 0.
     """
-    tensors = [*module.parameters(), *module.buffers()]
-    return [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]
+    versions = []
+    for tensor in (*module.parameters(), *module.buffers()):
+        version = 0 if tensor.is_inference() else tensor._version
+        versions.append((tensor.data_ptr(), version))
+    return versions
 
 
 @contextmanager

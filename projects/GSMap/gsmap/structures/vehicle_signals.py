@@ -1,4 +1,4 @@
-"""Motion of a vehicle as 18 numbers in MapTR's layout (``can_bus``)."""
+"""Vehicle signals: pose and motion of a vehicle as 18 numbers in MapTR's layout (``can_bus``)."""
 
 from typing import Any
 
@@ -20,8 +20,9 @@ def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float
         global_from_ego: Transform from the vehicle to the world in metres. (4, 4)
 
     Returns:
-        Position (3) in metres, orientation (w, x, y, z), acceleration (3) in m/s^2, rotation rate
-        (3) in rad/s, velocity (3) in m/s, yaw in radians, yaw in degrees in [0, 360). (18,)
+        Position (3) in metres and orientation (w, x, y, z) in the world; acceleration (3) with
+        gravity in m/s^2, rotation rate (3) in rad/s and velocity (3) in m/s, all in the frame of
+        the vehicle; yaw in the world in radians, and in degrees in [0, 360). (18,)
     """
     values = np.zeros(NUM_CAN_BUS)
     values[:3] = global_from_ego[:3, 3]
@@ -35,7 +36,8 @@ def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float
 def pose_only_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Compute signals from a pose like MapTR's code for Argoverse 2.
 
-    Acceleration, rotation rate and velocity, which are not recorded there, are one.
+    All entries of acceleration, rotation rate and velocity are 1, because Argoverse 2 has no
+    measurements of them.
 
     Args:
         global_from_ego: Transform from the vehicle to the world in metres. (4, 4)
@@ -51,7 +53,7 @@ def pose_only_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.
 def motion_signals(
     now: Pose, before: Pose | None = None, after: Pose | None = None
 ) -> NDArray[np.float64]:
-    """Compute signals from poses: `pose_signals`, and rates from differences of the poses.
+    """Compute signals from poses: `pose_signals`, with the motion from differences of the poses.
 
     Args:
         now: Pose at the time of the signals.
@@ -62,7 +64,7 @@ def motion_signals(
         Signals in the layout of `pose_signals`. (18,)
     """
     time, pose = now
-    # At the start and the end of a drive, the pose itself takes the place of the missing one.
+    # At the start and the end of a drive, the current pose replaces the missing one.
     start, first = before or now
     end, last = after or now
     values = pose_signals(pose)

@@ -95,7 +95,7 @@ class CommandParser(argparse.ArgumentParser):
         return names
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Raise an error with the most similar choice if a value is none of the choices."""
+        """Raise an error with the most similar choice if a value is not one of the choices."""
         try:
             super()._check_value(action, value)
         except argparse.ArgumentError as error:
@@ -144,8 +144,9 @@ def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True
 
     Args:
         command: Function that returns the text to print, or None.
-        clean_up_on_kill: Whether the clean-up runs after ``kill``. The ranks of a training wait for
-            each other and should die at once instead. If False, `end_process` ends a rank.
+        clean_up_on_kill: Whether the clean-up runs after ``kill``. It should not run in the ranks
+            (processes) of a training: they wait for each other, and should die at once. If False,
+            a rank ends by `end_process`.
     """
     try:
         _run(command, clean_up_on_kill=clean_up_on_kill)
@@ -158,17 +159,17 @@ def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True
 
 
 def _is_rank() -> bool:
-    """Whether this process is one of several of a training or test."""
+    """Whether this process is a rank, one of the processes of a training or test."""
     return "RANK" in os.environ
 
 
 def end_process(code: int) -> NoReturn:
     """Run the exit functions of the process and end it, without the shutdown of the interpreter.
 
-    The threads of gloo take the lock of the interpreter (GIL) in C++ destructors. During the
-    shutdown, Python stops every thread that waits for this lock. Stopping a thread inside a
-    destructor aborts the process. If the main thread is deleting a process group, it may also wait
-    forever for the stopped thread.
+    The threads of gloo, torch's library for communication between processes, take the lock of the
+    interpreter (GIL) in C++ destructors. During the shutdown, Python stops every thread that waits
+    for this lock. Stopping a thread inside a destructor aborts the process. If the main thread is
+    deleting a process group, it may also wait forever for the stopped thread.
 
     Args:
         code: Exit code.
@@ -183,7 +184,7 @@ def end_process(code: int) -> NoReturn:
 
 
 def _exit_code(error: BaseException) -> int:
-    """Return the exit code of Python for an exception, and print its message or traceback."""
+    """Return Python's exit code for an exception, and print its message or traceback."""
     if not isinstance(error, SystemExit):
         sys.excepthook(type(error), error, error.__traceback__)
         return 1
@@ -210,7 +211,7 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
             sys.stdout.flush()
         except Exception as error:
             cause = _signal_behind(error)
-            # An OSError after a signal comes from a clean-up that failed: it is reported below.
+            # After a signal, an OSError comes from a clean-up that failed, and is reported below.
             if cause is not None and not isinstance(error, OSError):
                 handler.has_ended = True
                 raise cause from None
@@ -264,7 +265,7 @@ def _report(error: BaseException | None) -> bool:
 
 
 def _report_thread_error(args: Any) -> None:
-    """Report an error in a library's thread, for example of a log on a full disk."""
+    """Report an error in a thread of a library, such as a full disk while it writes a log."""
     if not _report(args.exc_value):
         threading.__excepthook__(args)
 

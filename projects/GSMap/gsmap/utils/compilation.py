@@ -13,7 +13,7 @@ _CACHE_NOTE = " They are kept for the next runs, in __pycache__ or NUMBA_CACHE_D
 
 
 class CompilationNotice(event.Listener):
-    """Logs once per process that kernels are compiled; cached kernels cause no message."""
+    """Listener that logs once per process that kernels are compiled, unless they are cached."""
 
     has_logged = False
 

@@ -41,7 +41,7 @@ _NO_DEVICE = re.compile(
     "not compiled with CUDA|no NVIDIA driver|No CUDA GPUs|invalid device ordinal|device string"
 )
 _NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", flags=re.DOTALL)
-_IN_WORKER = "Original Traceback (most recent call last)"  # marks a message of torch's DataLoader
+_IN_WORKER = "Original Traceback (most recent call last)"  # in errors of a DataLoader's worker
 
 
 def user_message(error: BaseException) -> str | None:
@@ -83,7 +83,7 @@ def is_machine_error(error: BaseException) -> bool:
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:
-    """Return ``; did you mean ...?`` with the most similar name, empty if none is similar.
+    """Return ``; did you mean ...?`` with the most similar name, or an empty text without one.
 
     Args:
         name: Unknown name.
@@ -94,12 +94,12 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 
 
 def registry_names(registry: Any) -> list[str]:
-    """Return the names in a registry of mmengine and in all registries of its family."""
+    """Return the names in a registry of mmengine, its root and all registries below the root."""
     root = registry
     while root.parent is not None:
         root = root.parent
     family = [root]
-    for member in family:  # grows while it is read
+    for member in family:  # the list grows during the loop
         family.extend(member.children.values())
     names = []
     for member in family:

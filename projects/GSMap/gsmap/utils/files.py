@@ -32,7 +32,7 @@ except ImportError:  # Windows, where files are not locked
     fcntl = None  # type: ignore[assignment]
 
 SUFFIX = ".gsmap-partial"  # ending of temporary files, which no other program uses
-_BOOT = Path("/proc/sys/kernel/random/boot_id")  # equal in all containers of a machine
+_BOOT = Path("/proc/sys/kernel/random/boot_id")  # an ID shared by all containers of a machine
 # Eight digits that identify this machine until its next start.
 _MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(nbytes=4)
 _PARTIAL_NAME = re.compile(
@@ -41,7 +41,7 @@ _PARTIAL_NAME = re.compile(
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
 _STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to the open files of a process
-_REGISTERED_FOLDERS: set[Path] = set()  # by `register_folder`
+_REGISTERED_FOLDERS: set[Path] = set()  # filled by `register_folder`
 _HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # content of a lock file
 _DIGEST_ENDING = re.compile(r"-[0-9a-f]{16}\Z")  # ending of names that `file_name` has changed
 # Exceptions of `zipfile` for a damaged archive
@@ -70,8 +70,8 @@ def file_name(foreign: str) -> str:
 def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[str, str]:
     """Convert names from a file to safe names of distinct files (`file_name`).
 
-    Names also get a digest if their files would differ in upper and lower case only, which some
-    file systems do not distinguish, or if a name with an ending would be the file of another name.
+    Names also get a digest in two cases: if two files would differ only in upper and lower case,
+    which some file systems do not distinguish, or if a name with an ending equals another file.
 
     Args:
         foreign: Untrusted names.
@@ -82,7 +82,8 @@ def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[s
     """
     names = {name: file_name(name) for name in foreign}
     # A changed name may coincide with another file, so all names are checked again after a change.
-    # A name with its digest stays as it is. So each name changes at most once, and the loop ends.
+    # A name that has its digest does not change again. So each name changes at most once, and the
+    # loop ends.
     while True:
         uses: Counter[str] = Counter()
         for name in names.values():
@@ -102,7 +103,7 @@ def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[s
 
 
 def _folded_names(name: str, endings: Sequence[str]) -> list[str]:
-    """Return a file name with each ending, without the distinction of upper and lower case."""
+    """Return a file name with each ending, converted so that upper and lower case are equal."""
     return [f"{name}{ending}".casefold() for ending in endings]
 
 
@@ -152,10 +153,11 @@ def register_folder(path: Path) -> Path:
 def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
     """Open a file for writing that replaces ``path`` when the block ends without an exception.
 
-    The content is written to a file beside it (`partial_path`), which is removed after an
-    exception, so a reader opens either the old file or the complete new one. The new file keeps the
-    permissions of the old one. A link is replaced, not followed. A device or a pipe, such as
-    ``/dev/null``, is written directly. Missing parent folders are created. Text is UTF-8.
+    The content is written to a temporary file beside ``path`` (`partial_path`), which is removed
+    after an exception. A reader therefore opens either the old file or the complete new one. The
+    new file keeps the permissions of the old one. A link is replaced, not followed. A device or a
+    pipe, such as ``/dev/null``, is written directly. Missing parent folders are created. Text is
+    encoded in UTF-8.
 
     Args:
         path: File to create or replace.
@@ -170,20 +172,20 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
         if path.is_relative_to(folder):
             require_no_link(path.parent, below=folder.parent)
     encoding = None if "b" in mode else "utf-8"
-    special = _is_special(path)
+    is_special = _is_special(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     failures: list[OSError] = []
     try:
         with (
-            nullcontext(path) if special else partial_path(path) as partial_file,
+            nullcontext(path) if is_special else partial_path(path) as partial_file,
             io.BufferedWriter(_RawFile(partial_file, failures=failures)) as buffer,
             buffer if encoding is None else io.TextIOWrapper(buffer, encoding=encoding) as file,
         ):
-            if not special:
+            if not is_special:
                 _keep_mode(path=path, handle=file.fileno())
             yield file
             file.flush()
-            if not special:
+            if not is_special:
                 os.fsync(file.fileno())
                 # A command must not read a file that it will replace (`inputs.declare_files`). The
                 # new file may be read.
@@ -216,7 +218,7 @@ class _RawFile(io.FileIO):
 
 
 def _open_unlinked(path: str, flags: int) -> int:
-    """Open a file for writing; links are followed for devices and pipes only."""
+    """Open a file for writing. Links are followed only to devices and pipes."""
     may_be_link = _is_special(Path(path))  # such as /dev/stdout
     if not may_be_link:
         flags |= os.O_NOFOLLOW
@@ -255,15 +257,15 @@ def open_to_append(path: Path) -> io.FileIO:
 
 
 def require_no_link(path: Path, below: Path | None = None) -> None:
-    """Require a folder whose path has no links.
+    """Raise ValueError if a folder, or a folder between it and ``below``, is a link.
 
     Args:
-        path: Folder whose name the command chooses.
-        below: Folder above it that the user has named, and whose path may have links; by default
-            its parent.
+        path: Folder whose name is chosen by the command.
+        below: Folder above ``path`` that was named by the user, by default the parent of ``path``.
+            It may be a link or have links in its path.
 
     Raises:
-        ValueError: If the folder, or a folder between the two, is a link.
+        ValueError: If one of these folders is a link.
     """
     top = path.parent if below is None else below
     for folder in (path, *path.parents):
@@ -284,7 +286,7 @@ def remove_link(path: Path) -> None:
 
 
 def _is_plain(status: os.stat_result) -> bool:
-    """Whether a path is a file without further hard links; a symbolic link is not."""
+    """Whether a status belongs to a regular file (not a link) with only one hard link."""
     return stat.S_ISREG(status.st_mode) and status.st_nlink == 1
 
 
@@ -356,7 +358,7 @@ def partial_path(path: Path, make: Callable[[Path], object] = _touch) -> Iterato
 
     Its name is ``PATH.<machine>-<random>.gsmap-partial``. It is locked during the block and removed
     at the end of the block. Before the block, temporary files that no process has locked are
-    removed from the folder: their writers were killed.
+    removed from the folder, because their writers were killed.
 
     Args:
         path: Final path of the file or folder.
@@ -366,7 +368,8 @@ def partial_path(path: Path, make: Callable[[Path], object] = _touch) -> Iterato
     while True:
         temporary = path.with_name(f"{path.name}.{_MACHINE}-{secrets.token_hex(nbytes=4)}{SUFFIX}")
         make(temporary)
-        # Before it is locked, another process may take it for a leftover and remove it.
+        # Before the file is locked, another process may mistake it for a leftover and remove it. In
+        # this case, the loop tries again.
         with suppress(FileNotFoundError):
             handle = _open(temporary)
             if try_lock(handle) is not False and temporary.exists():
@@ -419,7 +422,7 @@ _LOCK_FILES: "weakref.WeakSet[IO[str]]" = weakref.WeakSet()
 
 
 def _close_lock_files() -> None:
-    """Close the lock files in a forked worker, which would keep the locks if its parent dies."""
+    """Close the lock files in a forked worker, so that it does not keep the locks of its parent."""
     for file in list(_LOCK_FILES):
         file.close()
 
@@ -481,7 +484,8 @@ def lock_file(path: Path, subject: Path, advice: str) -> IO[str]:
 def _remove_leftovers(folder: Path) -> None:
     """Remove temporary files of killed writers.
 
-    Locks of other machines may be invisible here, so their files are removed after a day.
+    Locks of other machines may be invisible on this one, so files of other machines are removed
+    only after a day.
     """
     for name in os.listdir(folder):
         match = _PARTIAL_NAME.fullmatch(name)
@@ -514,8 +518,8 @@ def _remove(path: Path) -> None:
 def _is_special(path: Path) -> bool:
     """Whether a path is a device, a pipe or a socket, which a file must not replace.
 
-    A link to one of them counts only if the link is in ``/dev`` or in a folder of open files. Links
-    elsewhere may be replaced.
+    A link to one of them counts only if the link is in ``/dev`` or in a folder of open files
+    (`_STREAMS`). Links elsewhere may be replaced.
     """
     follow = path.parent in (_DEVICES, *_STREAMS)
     try:

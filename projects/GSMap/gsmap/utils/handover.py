@@ -19,15 +19,15 @@ _default_handler = queues.Queue._on_queue_feeder_error  # type: ignore[attr-defi
 def report_lost_batches() -> None:
     """Report batches that cannot be sent, in this process and in its forked workers.
 
-    A worker serialises its batches in a thread, in which Python prints an error and drops the
-    batch. The replacement sends the error in place of the batch.
+    A worker serialises its batches in a thread. If that fails, Python prints an error and drops
+    the batch. The replacement of Python's function sends the error in place of the batch.
     """
     queues.Queue._on_queue_feeder_error = _send_error  # type: ignore[attr-defined]
 
 
 def _send_error(queue: "queues.Queue[Any]", error: Exception, item: Any) -> None:
     """Send an error with the index of a batch in place of the batch."""
-    # Imported here, so that importing this module does not load torch. A worker has loaded it.
+    # Imported here, so that importing this module does not load torch. Workers have loaded torch.
     from torch._utils import ExceptionWrapper
 
     index: Any = None

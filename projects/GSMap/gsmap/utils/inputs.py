@@ -1,4 +1,4 @@
-"""Protection of input files and of files of other programs from the outputs of a command."""
+"""Protection of a command's inputs, and of other programs' files, from being overwritten."""
 
 import os
 import stat
@@ -13,11 +13,11 @@ from gsmap.utils.errors import InputError, WorkError
 _Identity = tuple[int, int, int]  # device, inode and modification time of a file
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _SYSTEM_FOLDERS = ("/dev/", "/proc/", "/sys/")  # pipes and devices there may be read
-_MARKED_BYTES = 1 << 16  # length of the start and of the end of a file that `has_mark` searches
+_MARKED_BYTES = 1 << 16  # number of bytes that `has_mark` searches at each end of a file
 
 
 class InputReplacedError(WorkError):
-    """Error of a command that would overwrite a file that it reads."""
+    """Error that is raised when a command would overwrite a file that it reads."""
 
 
 class _Command:
@@ -30,7 +30,7 @@ class _Command:
 
 
 def watch_files() -> None:
-    """Check every file that this process opens after this call (`check_input`)."""
+    """Check every file that this process opens for reading after this call (`check_input`)."""
     _Command.is_running = True
     if not _Command.has_hook:
         sys.addaudithook(_on_event)
@@ -39,7 +39,7 @@ def watch_files() -> None:
 
 @contextmanager
 def protect_inputs() -> Iterator[None]:
-    """Context in which overwriting an input or reading a pipe is an error.
+    """Context manager in which overwriting an input or reading a pipe raises an error.
 
     `declare_files` names the inputs. The writers of `gsmap.utils.files` check them
     (`require_no_input`), and an audit hook checks each file that is read.
@@ -56,16 +56,16 @@ def protect_inputs() -> Iterator[None]:
 def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -> None:
     """Declare the files that a command's arguments name, before the command begins.
 
-    Afterwards, reading a declared output and overwriting a declared input raise an error. This
-    includes files that are found in a folder or named in a config, and other names of a file
-    (symbolic and hard links).
+    Afterwards, reading a declared output or overwriting a declared input raises an error. This also
+    holds if the file is found in a folder, is named in a config, or has another name (a symbolic or
+    hard link).
 
     Args:
         inputs: Files that the command reads.
         outputs: Files that the command writes, each with the option that names it.
 
     Raises:
-        InputReplacedError: If a file is an input and an output.
+        InputReplacedError: If a file is both an input and an output.
         ValueError: If two options name one output.
     """
     places: dict[str, str] = {}
@@ -93,7 +93,7 @@ def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -
 def check_input(path: str | bytes | os.PathLike) -> None:
     """Check a file before it is read.
 
-    Code calls this for libraries that do not open files through Python.
+    It must be called before a library reads a file without Python's ``open``.
 
     Args:
         path: Path of the file.
@@ -107,7 +107,7 @@ def check_input(path: str | bytes | os.PathLike) -> None:
         return
     try:
         status = os.stat(path)
-    except (OSError, ValueError):  # the reader reports it
+    except (OSError, ValueError):  # the code that reads the file will report the error
         return
     if stat.S_ISREG(status.st_mode):
         if _Command.outputs:
@@ -158,17 +158,18 @@ def has_mark(path: Path, mark: bytes) -> bool:
 
 
 def require_own_file(path: Path, mark: bytes) -> None:
-    """Require that no other program's file is at a path at which a command writes.
+    """Require that the path to which a command writes does not have another program's file.
 
-    The command may replace a file that an earlier run of it has written. It may also replace a
-    link: `atomic_write` replaces the link itself, and the target of the link does not change.
+    The command may replace a file that an earlier run of the command has written. It may also
+    replace a link: `atomic_write` replaces the link itself, and the target of the link does not
+    change.
 
     Args:
-        path: Path of the file. The user has named its folder, and the command its name.
-        mark: Bytes at the start or at the end of each such file of the command.
+        path: Path of the file. The user has chosen the folder, and the command the file name.
+        mark: Bytes near the start or the end of each such file of the command.
 
     Raises:
-        ValueError: If another program's file, or no plain file, has this name.
+        ValueError: If the path is another program's file, or exists and is not a plain file.
     """
     try:
         mode = path.lstat().st_mode
@@ -184,7 +185,7 @@ def require_own_file(path: Path, mark: bytes) -> None:
 
 
 def forget_output(path: Path) -> None:
-    """Allow a file to be read again, because an output is about to replace it."""
+    """Allow the reading of a file that was declared as an output and is about to be replaced."""
     if not _Command.outputs:
         return
     identity = _identity(path)
@@ -193,13 +194,15 @@ def forget_output(path: Path) -> None:
 
 
 def _on_event(event: str, arguments: tuple[Any, ...]) -> None:
-    """Check each file that Python or SQLite opens; an audit hook."""
+    """Audit hook that checks each file that Python opens for reading or that SQLite opens."""
     if not _Command.is_running:
         return
     if event == "open":
         path, _, flags = arguments
-        if isinstance(path, str | bytes) and not (flags or 0) & _WRITING:
-            check_input(path)
+        if isinstance(path, str | bytes):
+            is_written = (flags or 0) & _WRITING
+            if not is_written:
+                check_input(path)
     elif event == "sqlite3.connect" and isinstance(arguments[0], str):
         path, _, _ = arguments[0].removeprefix("file:").partition("?")
         check_input(path)
@@ -209,7 +212,7 @@ def _identity(path: str | bytes | os.PathLike) -> _Identity | None:
     """Return a value that identifies a file under all of its names; None if it is not a file."""
     try:
         status = os.stat(path)
-    except (OSError, ValueError):  # a name with a zero byte
+    except (OSError, ValueError):  # ValueError for a name with a zero byte
         return None
     if not stat.S_ISREG(status.st_mode):
         return None

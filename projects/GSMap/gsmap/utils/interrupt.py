@@ -9,7 +9,7 @@ INTERRUPTED_TEXT = "interrupted: nothing half-written is left\n"
 
 
 def is_first_rank() -> bool:
-    """Whether this process prints the messages of a run; known before the ranks connect."""
+    """Whether this process prints the messages of a run. Can be called before the ranks connect."""
     return os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) == "0"
 
 
@@ -25,7 +25,7 @@ def starts_a_command() -> bool:
     """Whether this process is ``gsmap`` or a script of ``tools``, but not a worker process."""
     script = os.path.realpath(sys.argv[0]) if sys.argv else ""
     folder, name = os.path.split(script)
-    # Of the folders with scripts, only ``tools`` contains this file.
+    # The file dist_run.sh exists only in the folder ``tools``.
     is_tool = os.path.isfile(os.path.join(folder, "dist_run.sh"))
     is_command = name == "gsmap" or is_tool or _runs_a_module()
     return is_command and "--multiprocessing-fork" not in sys.orig_argv
@@ -34,14 +34,14 @@ def starts_a_command() -> bool:
 def leave_at_once_on_ctrl_c() -> None:
     """End this process on Ctrl-C with one line and exit code 130.
 
-    A handler that is set already, or that ignores the signal, is kept.
+    If the signal already has another handler, or is ignored, nothing changes.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
 
 
 def _leave(number: int, _frame: object) -> None:
-    """End the process at once, because some imports would catch an exception."""
+    """End the process at once. An exception would be caught by some imports."""
     if is_first_rank():
         os.write(2, INTERRUPTED_TEXT.encode())
     os._exit(128 + number)

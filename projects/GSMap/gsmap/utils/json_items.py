@@ -22,7 +22,7 @@ _DECODER = json.JSONDecoder()
 def items_of(
     path: Path, key: str | None, advice: str, other_entries: dict[str, Any] | None = None
 ) -> Generator[tuple[Any, Place], None, None]:
-    """Yield the value and the place of each item of a list, with constant memory.
+    """Yield the value and the place of each item of a list; the memory does not grow with the list.
 
     Args:
         path: JSON file.
@@ -108,8 +108,8 @@ class _Parser:
     def _require(self, opening: str, where: str) -> None:
         """Require that the next value begins with a character.
 
-        Only objects, lists and texts are reported here as values of another kind. The caller then
-        consumes ``opening``, which fails for anything else.
+        An object, a list or a text in its place raises an error that names the kind of the value.
+        Other values raise an error later, when the caller consumes ``opening``.
         """
         character = self._next_character()
         if character != opening and character in _KINDS:
@@ -166,8 +166,8 @@ class _Parser:
     def _read_block(self) -> bool:
         """Append a block of the file to the unread text; False at the end of the file.
 
-        The block is as long as the unread text if that is longer, so that the time for a value of
-        many blocks is linear in its length.
+        The block is at least as long as the unread text. So a value of many blocks is parsed again
+        only a few times, and the total time is linear in its length.
         """
         rest = self._text[self._position :]
         block = self._file.read(max(_BLOCK, len(rest)))

@@ -9,12 +9,12 @@ from typing import Any
 def lazy_names(
     package: str, modules: Mapping[str, str], others: Mapping[str, str] | None = None
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Make ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
+    """Make ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazily imported names.
 
     Args:
         package: ``__name__`` of the package.
-        modules: Module, relative to the package, that defines each name.
-        others: Full name of the module that defines each name from another package.
+        modules: For each name, the module of the package that defines it, relative to the package.
+        others: For each name from another package, the full name of the module that defines it.
 
     Returns:
         ``__getattr__``, ``__dir__`` and ``__all__``.
@@ -27,7 +27,7 @@ def lazy_names(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = import_module(places[name])
         value = getattr(module, name)
-        setattr(sys.modules[package], name, value)
+        setattr(sys.modules[package], name, value)  # later uses do not call this function
         return value
 
     def list_names() -> list[str]:

@@ -7,7 +7,8 @@ from gsmap.utils.errors import InputError
 
 CHECKPOINT = "checkpoint"  # key in results: SHA-256 of the checkpoint file
 CALIBRATION = "calibration"  # key in checkpoints and results: fit of the sigmas to the errors
-MOUNT = "mount"  # key of metainfo: transform from annotations to the ground below the rear axle
+# Key of metainfo: transform from the annotation frame to the ground below the rear axle.
+MOUNT = "mount"
 RIG = "rig"  # key of metainfo: width, height, fx, fy, cx, cy of the images in pixels, by camera
 LAW_NAMES = ("normal", "laplace")  # distributions of the errors
 
@@ -19,9 +20,9 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
         meta: Metadata of the checkpoint or the result file; untrusted.
 
     Returns:
-        ``law``, the distribution of the errors, and ``sigmas``, the half width, in standard
-        deviations, of the interval of errors to which the Gaussians were fitted. Empty if there is
-        no calibration.
+        ``law``, the distribution of the errors, and ``sigmas``, the number n that sets the coverage
+        of the fitted interval of errors: the probability of a normal error within n standard
+        deviations. Empty if there is no calibration.
 
     Raises:
         ValueError: If the law is unknown, or ``sigmas`` is not a number in (0, 3].

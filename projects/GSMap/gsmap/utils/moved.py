@@ -1,4 +1,4 @@
-"""Import of modules by their former names, for configs and code outside this repository."""
+"""Import of moved modules by their former names, for configs and code outside this repository."""
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -11,7 +11,7 @@ _MAPTR = "gsmap.models.maptr"
 _BASE = "gsmap.models.base"
 # Modules that moved from `gsmap.models.maptr` to `gsmap.models.base`.
 _BASE_MODULES = ("coder", "decoder", "head", "layers", "masks", "pairs", "parts")
-# Modules that moved from `gsmap.evaluation` to a subpackage, by the name of the subpackage.
+# Modules that moved from `gsmap.evaluation` to its subpackages, by the name of the subpackage.
 _EVALUATION = {
     "core": (
         "average_precision",
@@ -42,7 +42,7 @@ _EVALUATION = {
 
 
 def _successors() -> dict[str, tuple[str, ...]]:
-    """Return the modules that hold the contents of each former module."""
+    """Return the modules to which the contents of each former module have moved."""
     successors: dict[str, tuple[str, ...]] = {}
     for name in _BASE_MODULES:
         successors[f"{_MAPTR}.{name}"] = (f"{_BASE}.{name}",)
@@ -55,11 +55,11 @@ def _successors() -> dict[str, tuple[str, ...]]:
 
 
 MOVED: Mapping[str, tuple[str, ...]] = MappingProxyType(_successors())
-"""Modules that hold the contents of each former module."""
+"""Modules to which the contents of each former module have moved, by its name."""
 
 
 class MovedModules(MetaPathFinder, Loader):
-    """Importer of former module names; a former module holds the contents of its successors."""
+    """Importer of modules by their former names, with the contents of the modules in `MOVED`."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -77,7 +77,10 @@ class MovedModules(MetaPathFinder, Loader):
         return spec_from_loader(name=fullname, loader=self) if fullname in MOVED else None
 
     def exec_module(self, module: ModuleType) -> None:
-        """Fill a module with the contents of its successors, which register their classes."""
+        """Fill a former module with the contents of its successors.
+
+        Importing the successors registers their classes.
+        """
         for successor in MOVED[module.__name__]:
             contents = vars(import_module(successor))
             for name, value in contents.items():

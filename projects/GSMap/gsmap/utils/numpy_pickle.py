@@ -25,7 +25,7 @@ _MAX_INTEGER = {"b": 1, "U": 0x10FFFF}  # largest boolean and largest character
 
 
 class CheckedDtype:
-    """Dtype from a pickle: numbers, booleans or strings, in either byte order.
+    """Dtype from a pickle, for numbers, booleans or strings in either byte order.
 
     Args:
         code: Short name of the dtype, such as ``f4``.
@@ -45,7 +45,7 @@ class CheckedDtype:
     def __setstate__(self, state: Any) -> None:
         is_plain = isinstance(state, tuple) and all(type(part) in _STATE_PARTS for part in state)
         for candidate in (self.dtype.newbyteorder("<"), self.dtype.newbyteorder(">")):
-            numpy_state = candidate.__reduce__()[2]  # the state with which numpy pickles it
+            numpy_state = candidate.__reduce__()[2]  # state of this dtype in a pickle of numpy
             if is_plain and state == numpy_state:
                 self.dtype = candidate
                 return
@@ -53,7 +53,10 @@ class CheckedDtype:
 
 
 class CheckedArray(np.ndarray):
-    """Array from a pickle, empty until its state is set; it is pickled as an ordinary array."""
+    """Array from a pickle.
+
+    The array is empty until its state is set. When it is pickled, it becomes an ordinary array.
+    """
 
     def __new__(cls, *arguments: Any) -> "CheckedArray":
         """Create an empty array; arguments raise an ``UnpicklingError``."""
@@ -77,7 +80,7 @@ class CheckedArray(np.ndarray):
         dtype = checked.dtype
         if size * dtype.itemsize != len(data):
             raise pickle.UnpicklingError(f"an array {shape} of {dtype} has {len(data)} bytes")
-        # Some bytes are no valid boolean (more than 1) or character (beyond Unicode).
+        # Booleans above 1, and characters beyond Unicode, are not valid.
         order = ">" if dtype.byteorder == ">" else "<"
         integer_dtype = {"b": "u1", "U": f"{order}u4"}.get(dtype.kind)
         if integer_dtype and data:
@@ -91,14 +94,14 @@ class CheckedArray(np.ndarray):
 
 
 def _array(kind: Any, *_placeholder: Any) -> CheckedArray:
-    """Replacement of ``_reconstruct``."""
+    """Replacement of numpy's ``_reconstruct``, which creates an empty array."""
     if kind is not CheckedArray:
         raise pickle.UnpicklingError("it makes an array of another class than numpy.ndarray")
     return CheckedArray()
 
 
 def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> CheckedArray:
-    """Replacement of ``_frombuffer``."""
+    """Replacement of numpy's ``_frombuffer``, which creates an array from its bytes."""
     array = CheckedArray()
     content = bytes(data) if isinstance(data, bytearray) else data
     array.__setstate__((1, shape, dtype, order == "F", content))
@@ -106,7 +109,7 @@ def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> CheckedArray:
 
 
 def _scalar(dtype: Any, data: Any) -> Any:
-    """Replacement of ``scalar``."""
+    """Replacement of numpy's ``scalar``, which creates a scalar from its bytes."""
     array = _from_buffer(data=data, dtype=dtype, shape=(), order="C")
     return np.asarray(array)[()]
 
@@ -130,4 +133,4 @@ CHECKED: dict[str, Any] = {
     **{f"numpy.core.{name}": function for name, function in _ARRAY_FUNCTIONS.items()},
     **{f"numpy._core.{name}": function for name, function in _ARRAY_FUNCTIONS.items()},
 }
-"""Replacements by the names in a pickle."""
+"""Replacements, by the names of the replaced functions in a pickle."""

@@ -33,7 +33,7 @@ def check_kinds(settings: Any, overrides: Mapping[str, Any], source: str) -> Non
     """Refuse overrides whose kind differs from the kind of the value that they replace.
 
     A number cannot become a dictionary, nor a text other than ``auto``, ``cores`` or ``dynamic``. A
-    truth value cannot become a text, a dictionary or a list. A list cannot become a text. A
+    boolean cannot become a text, a dictionary or a list. A list cannot become a text. A
     dictionary or a list of dictionaries can only become a dictionary or a list of dictionaries.
     Every value may become None. The value None, and a value that the settings do not have, may
     become anything.
@@ -134,7 +134,7 @@ def describe_override(error: BaseException) -> str | None:
     """Describe an error that an override causes.
 
     Args:
-        error: Exception that ended a command, and that has no description of its own.
+        error: Exception that ended a command, and that no other code describes to the user.
 
     Returns:
         One sentence with the override; None if no override is involved, or if
@@ -165,7 +165,7 @@ def _frames(error: BaseException) -> Iterator[FrameType]:
 
 
 def _is_of_loop(frame: FrameType) -> bool:
-    """Whether a frame belongs to a loop or runner of mmengine, which have settings of all parts."""
+    """Whether a frame is of mmengine's runner or loops, which have the settings of all parts."""
     return str(frame.f_globals.get("__name__")).startswith("mmengine.runner")
 
 

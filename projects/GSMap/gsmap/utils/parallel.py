@@ -28,8 +28,9 @@ LAUNCHER = "GSMAP_LAUNCHER"  # environment variable with the process ID of torch
 _interpreter_flags = util._args_from_interpreter_flags  # type: ignore[attr-defined]
 
 
-# Linux's function for signals at the death of a parent. It is loaded here, because loading takes
-# locks, and in a forked process these may be held by threads that do not exist there.
+# Function of Linux that requests a signal at the death of the parent. It is loaded here and not in
+# a forked process, because loading takes locks. In a forked process, a lock may stay locked by a
+# thread that does not exist there.
 _PRCTL: Callable[..., Any] | None = None
 if sys.platform == "linux":
     _PRCTL = ctypes.CDLL(None).prctl
@@ -93,7 +94,7 @@ class _Worker:
 
 
 def _start_worker(setup: Path) -> None:
-    """Prepare a worker process, which ends with its parent."""
+    """Prepare a worker process, which ends with its parent; read its function from ``setup``."""
     escape_output()  # prints no control characters
     watch_files()  # raises an error if a pipe or an output of the command is read
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
@@ -138,8 +139,8 @@ def ordered_map(
     """Apply a function to tasks in worker processes, and yield the results in order.
 
     At most three tasks per worker are in progress, so neither tasks nor results accumulate. With
-    one worker, the function runs in this process. An error, Ctrl-C or the end of the generator
-    interrupts the tasks in progress, and their clean-up runs.
+    one worker, the function runs in this process. If an error or Ctrl-C occurs or the generator is
+    closed, the tasks in progress are interrupted and clean up.
 
     Args:
         function: Picklable function; it is sent to each worker once.

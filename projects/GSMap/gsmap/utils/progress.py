@@ -36,7 +36,7 @@ class Progress(tqdm):
 
     @property
     def format_dict(self) -> dict[str, Any]:
-        """Values of a line; without a known total, the format omits it."""
+        """Values that fill the format of a line. The format omits an unknown total."""
         values: dict[str, Any] = super().format_dict
         if values["bar_format"] == _FORMAT and values["total"] is None:
             values["bar_format"] = _UNKNOWN_TOTAL

@@ -30,10 +30,10 @@ def run_on_ray(
 ) -> str:
     """Run a command once per shard on a Ray cluster whose nodes share a file system.
 
-    A shard is repeated if a signal, or the failure of its worker or node, has stopped it. Once the
-    cluster has had free resources for twice the duration of the longest shard so far, and for at
-    least ``patience_s``, each unfinished shard is started a second time, and the first result
-    counts.
+    A shard is run again if it was stopped by a signal, or by the failure of its worker or node.
+    Once the cluster has had free resources for twice the duration of the longest shard so far, and
+    for at least ``patience_s``, each unfinished shard is started a second time. The first result of
+    a shard counts.
 
     Args:
         arguments: Parsed arguments; ``shards``, ``shard`` and ``per_shard`` are used.
@@ -156,7 +156,7 @@ class _Run:
             for task in ready:
                 index = running.pop(task)
                 failure = self._result(task)
-                has_second_task = index in running.values()  # which may still succeed
+                has_second_task = index in running.values()  # a second run, which may still succeed
                 if index in finished or (failure and has_second_task):
                     continue
                 finished.add(index)

@@ -79,10 +79,11 @@ class Shard:
         return target.with_name(f"{target.stem}.{number}{target.suffix}")
 
     def require_own(self, target: Path, mark: bytes) -> None:
-        """Require that the file of this shard and its manifest replace no other program's files.
+        """Check that this shard's file and manifest will not replace files of other programs.
 
         Args:
-            target: Path of the complete file; `WHOLE` replaces it, because the user names it.
+            target: Path of the complete file. For `WHOLE`, nothing is checked, because the user has
+                chosen this path.
             mark: Bytes at the start or at the end of each file of this kind.
 
         Raises:

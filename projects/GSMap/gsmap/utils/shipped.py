@@ -8,7 +8,7 @@ _MARKER = "models/registry.json"
 
 
 def shipped_path(path: str = "") -> Path:
-    """Return the installed place of a file or folder of the repository.
+    """Return the path at which a file or folder of the repository is installed.
 
     A wheel installs these files to ``gsmap/.mim``; an editable installation uses the repository.
 

@@ -52,9 +52,9 @@ def checked_identity(text: Any) -> str:
 
 
 def require_same_list(model: Any, data: Any, subject: str, remedy: str) -> None:
-    """Refuse evaluation data of another split than the training data of a model.
+    """Raise an error if a model was trained on another split than the evaluation data belong to.
 
-    Other splits of a data set may evaluate on places of the training.
+    Evaluation data of another split may be from places on which the model was trained.
 
     Args:
         model: Identity of the training list; None or empty if unknown, as in older files.
@@ -76,9 +76,10 @@ def require_same_list(model: Any, data: Any, subject: str, remedy: str) -> None:
 
 
 def require_results_of(split_list: str, about: Mapping[str, Any], path: object) -> None:
-    """Refuse results of a model that was trained on another split than the evaluation data.
+    """Raise an error if results do not belong to the split of the evaluation data.
 
-    Results for other data, which belong to another split, are refused as well.
+    This is the case if the model was trained on another split, or if the results are predictions
+    for data of another split.
 
     Args:
         split_list: Identity of the list of the evaluation data; empty if unknown.

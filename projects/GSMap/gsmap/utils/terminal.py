@@ -71,5 +71,5 @@ def escape_output() -> None:
 
 
 def unescaped_stream(stream: TextIO) -> TextIO:
-    """Return the stream below a `PrintableStream`, for a bar that moves the terminal's cursor."""
+    """Return the stream that a `PrintableStream` wraps, for a bar that moves the cursor."""
     return stream.stream if isinstance(stream, PrintableStream) else stream

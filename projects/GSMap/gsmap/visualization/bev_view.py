@@ -1,4 +1,4 @@
-"""Bird's-eye-view panels: metric grid, ego vehicle and map elements, with the road ahead at top."""
+"""Bird's-eye-view panels with a metric grid, the ego vehicle and map elements; ahead is up."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ class BEVPanel:
         """Kinds of matches, keys of ``MATCH_COLOURS``.
 
         Returns:
-            ``hit`` or ``false`` for each element (N,), or an empty list without ``hits``, and
+            Two lists: ``hit`` or ``false`` for each element (N,), empty if ``hits`` is None; and
             ``found`` or ``missed`` for each ground truth (K,).
         """
         hits: Sequence[int] = () if self.hits is None else self.hits.tolist()
@@ -176,7 +176,7 @@ def draw_lines(
         colours: Colour of each polyline. (N,)
         width_pt: Width of the lines in points.
         zorder: Drawing order of the lines. Higher values are drawn later, on top.
-        outcomes: ``hit`` or ``false`` for each polyline (N,), or empty to dash none.
+        outcomes: ``hit`` or ``false`` for each polyline (N,); empty for no dashed lines.
     """
     shapes = []
     faces = []
@@ -194,7 +194,7 @@ def draw_lines(
 
 
 def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
-    """Mark the first vertex with a ring, and the direction with an arrow head at the middle."""
+    """Mark the first vertex of each line with a ring, and the direction with an arrow head."""
     starts = np.stack([line[0] for line in lines])  # (N, 2)
     x, y = starts.T
     ax.scatter(x, y, s=13, facecolors="white", edgecolors=colours, linewidths=1.0, zorder=13)
@@ -223,6 +223,7 @@ def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: Map
     sin = np.sin(angles)
     axes = np.stack([cos, sin, -sin, cos], axis=-1).reshape(-1, 2, 2)  # one axis per row
     half_axes = elements.scales[..., None] * axes  # (M, 2, 2)
+    # A point (a, b) of the unit circle becomes a * first half axis + b * second half axis.
     outlines = _CIRCLE @ half_axes + centres[:, None]  # (M, 13, 2)
     ellipses = [Path(outline, _CIRCLE_CODES) for outline in outlines]
     paths = []  # one path per element
@@ -300,8 +301,8 @@ def raster_picture(rasters: np.ndarray, labels: np.ndarray, style: MapStyle) -> 
 def _draw_rasters(ax: Axes, picture: np.ndarray, view: FrameView) -> None:
     """Draw the picture of the rasters in place of the background."""
     if view.forward == "x":
-        # Rows of the picture are y (left) and its columns x (ahead), but the display has x upwards
-        # and -y (right) to the right. So the axes are swapped, and then the columns reversed.
+        # The rows of the picture run along y (left), and its columns along x (ahead). The display
+        # has x upwards and -y to the right, so the axes are swapped and the columns reversed.
         picture = picture.transpose(1, 0, 2)[:, ::-1]
     extent = (*ax.get_xlim(), *ax.get_ylim())
     ax.imshow(picture, origin="lower", extent=extent, interpolation="bilinear", zorder=1)

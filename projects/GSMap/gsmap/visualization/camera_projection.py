@@ -1,8 +1,8 @@
 """Projection of polylines into pinhole images, cut at the near plane and the edges of the image.
 
-Lines are cut in homogeneous pixel coordinates (u w, v w, w), in which each plane of the viewing
-frustum is a linear inequality and straight lines remain straight. So a line that runs behind the
-camera is cut correctly, without dense sampling.
+Lines are cut in homogeneous pixel coordinates (u w, v w, w). In these coordinates, straight lines
+remain straight, and each plane of the viewing frustum is a linear inequality. Therefore, a line
+that runs behind the camera is cut correctly, without dense sampling.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarra
 
 
 def _frustum_values(points: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Left sides of the five inequalities of the frustum, >= 0 inside. (n, 3) -> (5, n)"""
+    """Compute five values of each point, which are all >= 0 in the frustum. (n, 3) -> (5, n)"""
     width, height = size_px
     uw, vw, w = points.T
     return np.stack([w - NEAR_M, uw, width * w - uw, vw, height * w - vw])
@@ -36,8 +36,8 @@ def project_segments(
         size_px: Width and height of the image in pixels.
 
     Returns:
-        Visible parts of the segments in pixels (m, 2, 2), depth of their middle in metres (m,),
-        and index of the segment of each part (m,).
+        Visible parts of the segments in pixels, (m, 2, 2), mean depth of the two ends of each part
+        in metres, (m,), and index of the segment of each part, (m,).
     """
     first = _homogeneous_px(starts, img_from_frame)
     last = _homogeneous_px(ends, img_from_frame)
@@ -45,9 +45,9 @@ def project_segments(
     last_values = _frustum_values(last, size_px)  # (5, n)
     first_outside = first_values < 0
     last_outside = last_values < 0
-    # A segment crosses a plane where the left side of the inequality is 0: at this fraction of the
-    # way from the first end to the last one. The segment is visible from the last plane at which it
-    # enters the frustum to the first one at which it leaves.
+    # A segment crosses a plane where the plane's value is 0. `fraction` is the position of this
+    # point, from 0 at the first end to 1 at the last end. The segment is visible from the last
+    # plane at which it enters the frustum to the first plane at which it leaves.
     crosses = first_outside != last_outside
     change = np.where(crosses, first_values - last_values, 1.0)  # 1 avoids a division by 0
     fraction = np.where(crosses, first_values / change, 0.0)
@@ -85,7 +85,8 @@ def project_polygon(
         for start, end, start_value, end_value in zip(
             points, next_points, values, next_values, strict=True
         ):
-            # Vertices inside the plane remain, and each edge that crosses it gets a vertex there.
+            # Vertices on the inner side of the plane are kept. Each edge that crosses the plane
+            # gets a vertex at the crossing.
             if start_value >= 0:
                 cut_ring.append(start)
             if (start_value < 0) != (end_value < 0):
@@ -109,9 +110,10 @@ def subdivide(points: np.ndarray, step_m: float) -> np.ndarray:
     """
     lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths_m / step_m).astype(int), 1)
+    # The position i + s is at the share s of the segment from vertex i to vertex i + 1.
     parts = [index + np.arange(count) / count for index, count in enumerate(counts)]
     last_position = len(points) - 1.0
-    positions = np.concatenate([*parts, [last_position]])  # fractional vertex indices (m,)
+    positions = np.concatenate([*parts, [last_position]])  # (m,)
     vertices = np.arange(len(points))
     columns = [np.interp(positions, vertices, column) for column in points.T]
     return np.stack(columns, axis=1)

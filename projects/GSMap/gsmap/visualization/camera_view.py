@@ -22,7 +22,7 @@ from gsmap.utils.errors import InputError
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivide
 from gsmap.visualization.style import MapStyle
 
-_STEP_M = 2.0  # largest length of a segment, which has one depth and so one line width
+_STEP_M = 2.0  # largest length of a segment; each is drawn with one depth and one line width
 # Logarithm of the ratio of successive line widths. Widths are rounded to such steps, because all
 # segments of a class with equal widths are drawn together, as one path.
 _WIDTH_STEP = 0.2
@@ -71,7 +71,7 @@ Camera = TypeVar("Camera", CameraView, CameraRecord)
 
 
 def camera_title(name: str) -> str:
-    """Name of a channel in plain words."""
+    """Name of a channel in plain words, such as ``front left``."""
     words = name.lower().replace("_", " ").split()
     return " ".join(word for word in words if word not in ("cam", "ring", "camera"))
 

@@ -37,8 +37,8 @@ def write_fiftyone(
 ) -> int:
     """Write a JSON file that ``fiftyone.Dataset.from_json`` loads as a grouped data set.
 
-    A group is a sample, and its slices are the images of the cameras. Map elements are polylines in
-    the images: ``ground_truth``, and ``predictions`` with their scores.
+    Each sample is a FiftyOne group, whose slices are the images of the cameras. Map elements are
+    polylines in the images, in the fields ``ground_truth`` and ``predictions`` (with scores).
 
     Args:
         path: File to write.
@@ -108,7 +108,7 @@ def _images(
     classes: Sequence[str],
     root: Path,
 ) -> Iterator[dict[str, Any]]:
-    """Yield the images of a sample, as FiftyOne stores samples.
+    """Yield the images of a sample, each in the form in which FiftyOne stores a sample.
 
     Args:
         sample: The sample.
@@ -163,7 +163,7 @@ def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[flo
         camera: The camera.
 
     Returns:
-        Vertices of each part, in [0, 1].
+        Vertices (x, y) of each part, in [0, 1].
     """
     dense = subdivide(line, _STEP_M)
     size_px = (camera.width, camera.height)
@@ -174,7 +174,10 @@ def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[flo
         return []
     shares = np.clip(segments / size_px, 0.0, 1.0).round(_DECIMALS)  # (m, 2, 2)
     # A part ends where the next visible segment is not the next segment of the line.
-    breaks = [i + 1 for i, (before, after) in enumerate(pairwise(index)) if after != before + 1]
+    breaks = []
+    for position, (before, after) in enumerate(pairwise(index), start=1):
+        if after != before + 1:
+            breaks.append(position)
     parts = []
     for run in np.split(shares, breaks):
         # The points are the start of each segment, and the end of the last one.

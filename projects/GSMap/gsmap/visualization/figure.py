@@ -36,9 +36,9 @@ _SAVE_OPTIONS: dict[str, dict[str, Any]] = {
     "svg": {"metadata": {"Creator": "gsmap", "Date": None}},
 }
 FORMATS = tuple(_SAVE_OPTIONS)
-_MARGIN = 26  # px at DPI, as all lengths of the layout
+_MARGIN = 26  # px at DPI, like all lengths of the layout
 _GAP = 6  # between cameras
-_HEADER = 84
+_HEADER = 84  # space for the title and the legend
 _TICKS = 60  # space for the labels at the left of a panel and below it
 _TITLE = 44  # space for the title of a panel
 _USABLE = _WIDTH - 2 * _MARGIN
@@ -104,7 +104,7 @@ def _layout(
         aspect: Width / height of the panels.
 
     Returns:
-        Boxes of the cameras, boxes of the panels, and the lower edge of all in px.
+        Boxes of the cameras, boxes of the panels, and the lower edge of the whole layout in px.
     """
     if num_panels == 1 and len(rows) > 1:
         # Cameras of total width w have rows of total height slope * w + offset. The panel and its
@@ -141,7 +141,9 @@ def _add_axes(figure: Figure, box: Box) -> Axes:
     left, top, width, height = box
     bottom = figure.get_figheight() * DPI - top - height
     scale = np.tile(figure.get_size_inches() * DPI, 2)
-    return figure.add_axes(tuple(np.array([left, bottom, width, height]) / scale))
+    # Matplotlib takes shares of the figure's width and height, from the bottom left corner.
+    shares = np.array([left, bottom, width, height]) / scale
+    return figure.add_axes(tuple(shares))
 
 
 def _legend_lines(
@@ -309,7 +311,7 @@ def sample_name(metainfo: Mapping[str, Any], suffix: str) -> str:
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:
-    """Write a figure; the file is complete as soon as it exists.
+    """Write a figure to a file, which appears only when it is complete.
 
     Args:
         figure: Figure to render.
@@ -331,12 +333,14 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     content = BytesIO()
     figure.savefig(content, format=kind, **_SAVE_OPTIONS[kind])
     picture = content.getvalue()
-    write_bytes(path, _compress_svg(picture) if kind == "svg" else picture)
+    if kind == "svg":
+        picture = _compress_svg(picture)
+    write_bytes(path, picture)
     return path
 
 
 def _compress_svg(svg: bytes) -> bytes:
-    """Halve the size of an SVG: images as JPEG, numbers with two decimals, fewer blanks."""
+    """Reduce the size of an SVG by half: images as JPEG, two decimals, fewer blanks."""
     svg = _PNG_IN_SVG.sub(_jpeg_from_png, svg)
     svg = _LONG_NUMBER.sub(rb"\1", svg)
     return re.sub(rb" \n([MLC]) ", rb"\1", svg)

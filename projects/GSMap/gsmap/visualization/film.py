@@ -1,4 +1,4 @@
-"""Films of drives in H.264: cameras, the maps of result files side by side, the ground truth."""
+"""Films of drives in H.264: cameras, and the maps of results beside the ground truth."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
@@ -34,6 +34,7 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
         RuntimeError: If ``av`` (PyAV) is missing.
     """
     av = import_extra("av", "viz")
+    # The film has a constant rate, from the median period of the pictures.
     period_s = np.median(np.diff(times_ns)) / 1e9 if len(times_ns) > 1 else 0.5
     period_s = np.clip(period_s, 1 / 60, 10)
     rate = Fraction(1 / period_s).limit_denominator(100)  # pictures per second
@@ -65,10 +66,11 @@ def write_drive_film(
     max_frames: int = 200,
     width_px: int = 1280,
 ) -> str:
-    """Write a film of one drive: cameras with the first result, each result, the ground truth.
+    """Write a film of one drive.
 
-    Elements of results with tracks (``track_id``) have one colour for each track. Elements without
-    tracks, and elements over the cameras, have the colours of their classes.
+    Each picture shows the cameras with the elements of the first result, the map of each result,
+    and the ground truth. In the maps, elements of results with tracks (``track_id``) have one
+    colour for each track. All other elements have the colours of their classes.
 
     Args:
         path: File to write.
@@ -83,7 +85,7 @@ def write_drive_film(
         width_px: Width of the film in pixels.
 
     Returns:
-        Summary of the film in words.
+        Text with the name of the drive, the number of frames and the path.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -129,7 +131,7 @@ def _draw_frames(
     score_thr: float,
     width_px: int,
 ) -> Iterator[np.ndarray]:
-    """Draw the frames of a drive, as RGB. each (H, W, 3) uint8
+    """Draw the frames of a drive as RGB pictures. (H, W, 3) uint8 each
 
     Args:
         file: Annotation file.

@@ -37,7 +37,7 @@ def _visualizer(runner: Runner) -> MapVisualizer:
 @HOOKS.register_module()
 @dataclass(eq=False)
 class MapVisualizationHook(Hook):
-    """Draws predictions, into a folder in testing and to the visualizer's backends in validation.
+    """Hook that draws predictions: to a folder in testing, to visualizer backends in validation.
 
     In testing, each rank draws its samples. In validation, rank 0 draws a few fixed samples, so
     that the slider of TensorBoard shows their progress.
@@ -85,7 +85,7 @@ class MapVisualizationHook(Hook):
         _visualizer(runner).add_datasample(name, None, outputs[0], step=runner.iter, points=points)
 
     def before_test_epoch(self, runner: Runner) -> None:
-        """Reset the number of samples."""
+        """Reset the number of tested samples."""
         self._num_samples = 0
 
     def after_test_iter(

@@ -84,7 +84,7 @@ def predicted_elements(data_sample: Any) -> MapElements | None:
 
 @VISUALIZERS.register_module()
 class MapVisualizer(Visualizer):
-    """Draws samples: the map over the cameras, and bird's-eye views of truth and prediction.
+    """Visualizer of samples: the map over the cameras, and bird's-eye views of truth and results.
 
     Extent, classes and frame come from the ``metainfo`` of the data set (``dataset_meta``, which
     the runner sets). The cameras show the prediction, or else the ground truth.
@@ -95,7 +95,7 @@ class MapVisualizer(Visualizer):
             ground follows from the mounting of the sensor (``lidar2ego`` of the sample), or else
             from the height in the annotation file, or from the usual height of the frame.
         score_thr: Smallest score of a drawn prediction, in [0, 1].
-        panels: Bird's-eye views to draw, of ``PANELS``. Views without data are left out.
+        panels: Bird's-eye views to draw, from `PANELS`. Views without data are left out.
         match_m: Largest Chamfer distance of a hit in ``matches``, in metres, as in AP_chamfer.
         show_order: Whether to mark the start and the direction of elements.
         width_px: Width of the picture in pixels.
@@ -182,8 +182,8 @@ class MapVisualizer(Visualizer):
                 V x (h, w, 3) uint8
 
         Returns:
-            Cameras with an image: a camera whose path is None is left out, and all cameras if there
-            are neither images nor paths.
+            Cameras that have an image. A camera whose path is None is left out. The list is empty
+            if there are neither images nor paths.
 
         Raises:
             ValueError: If the numbers of images and projections disagree, or a file is missing or
@@ -221,7 +221,7 @@ class MapVisualizer(Visualizer):
         points: np.ndarray | None,
         note: str,
     ) -> list[BEVPanel]:
-        """Create the chosen bird's-eye views that the sample has data for.
+        """Create the chosen bird's-eye views for which the sample has data.
 
         Args:
             truth: Ground truth, if it is known.

@@ -78,9 +78,10 @@ def finish_shares(ax: Axes, title: str, x_label: str, y_label: str, colour: str 
 
 
 def plot_result(reports: Sequence[MetricReport]) -> Figure:
-    """Plot precision over recall of each class and the calibration, in a row per metric.
+    """Plot precision over recall of each class, and the calibration of the scores.
 
-    Lines have the colours of their classes, paler for stricter thresholds.
+    The figure has a row for each metric. Lines have the colours of their classes, and are paler for
+    stricter thresholds.
 
     Args:
         reports: Reports of one result, one per metric.
@@ -119,7 +120,7 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
                 y_label="" if label else f"{report.name}: precision",
                 colour=colour,
             )
-            # Reliability of the scores of detections; the intervals of vertices have `coverage`.
+            # `reliability` is for scores of detections, and `coverage` for intervals of vertices.
             score, share, _ = reliability(detections.scores, detections.hits[:, loosest])
             calibration_panel.plot(score, share, "o-", markersize=3, color=colour)
         finish_shares(calibration_panel, "calibration", x_label="score", y_label="share of hits")
@@ -127,7 +128,9 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
 
 
 def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "normal") -> Figure:
-    """Plot coverage of intervals and sparsification, in a row each for errors along and across.
+    """Plot coverage of intervals and sparsification, in one row for errors along and one across.
+
+    Coverage is the share of errors within an interval that the sigmas predict.
 
     Sparsification is the mean error of the remaining vertices when the vertices with the largest
     sigma are removed. The pale curve below it is the optimum: the vertices with the largest errors

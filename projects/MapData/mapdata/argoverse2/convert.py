@@ -70,7 +70,7 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     log_dirs = options.shard.part(log_dirs)
     jobs = [(log_dir, excluded_times.get(log_dir.name, ())) for log_dir in log_dirs]
     convert_log = partial(_try_log, options=options)
-    offsets_ns: list[int] = []
+    offsets_ns: list[int] = []  # times between a sample and its LiDAR sweep
     progress = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
     with progress as logs, AnnotationWriter(target, meta, shard=options.shard) as writer:
         results = ordered_map(convert_log, jobs, workers=_worker_count(options, log_dirs))
@@ -98,9 +98,10 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
 def _listed_logs(
     split_list: SplitList, options: Argoverse2Options, summary: ConversionSummary
 ) -> list[Path]:
-    """Find the logs of one part of a split list in any of the official folders.
+    """Find the logs of one part of a split list.
 
-    Published lists mix logs of ``train``, ``val`` and ``test``.
+    All official folders are searched, since published lists mix logs of ``train``, ``val`` and
+    ``test``.
     """
     if options.split not in split_list.scenes:
         raise InputError(
@@ -134,12 +135,16 @@ def _listed_logs(
 
 
 def _worker_count(options: Argoverse2Options, log_dirs: Sequence[Path]) -> int:
-    """Number of processes: at most one per log."""
+    """Number of worker processes: at most one per log, and at least one."""
     return min(options.workers, max(len(log_dirs), 1))
 
 
 def _excluded_times(log_dirs: list[Path], options: Argoverse2Options) -> dict[str, set[int]]:
-    """Times in nanoseconds, by name of the log, of samples dropped by ``thin_over="split"``."""
+    """Times in nanoseconds, by name of the log, of the samples to drop.
+
+    With ``thin_over="split"``, the samples of all logs are thinned out together. With ``"log"``,
+    each log is thinned out when it is read, so no times are returned here.
+    """
     if options.thin_over == "log":
         return {}
     assert options.rate_hz is not None  # checked by the options
@@ -182,7 +187,7 @@ def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -
 def _remove_unfit_logs(
     log_dirs: Sequence[Path], keep_map_changes: bool, summary: ConversionSummary
 ) -> list[Path]:
-    """Remove logs with unusable data and, by default, logs with a changed map; count both."""
+    """Remove logs with unusable data and, by default, logs with a changed map, and report both."""
     broken = "its map or sensor data cannot be used (known to fail)"
     changed = "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
     fit_logs = []

@@ -87,7 +87,7 @@ class Argoverse2Log:
 
     @cached_property
     def city(self) -> str:
-        """Short name of the city, such as ``PIT``; empty without a map file with such a name."""
+        """Short name of the city, such as ``PIT``; empty if no map file has a city in its name."""
         map_paths = (self.log_dir / "map").glob("log_map_archive_*____*.json")
         path = next(map_paths, None)
         if path is None:
@@ -215,8 +215,7 @@ def logs_in(folder: Path) -> list[Path]:
     """Find the logs in a folder or at most three levels below it, as in ``sensor/val/LOG``.
 
     Returns:
-        Sorted folders of the logs. Only the first level with logs is searched; empty if there is
-        none.
+        Sorted folders of the logs at the first level that has any; empty if there are no logs.
     """
     for depth in range(4):
         pattern = "*/" * depth + POSE_TABLE

@@ -29,16 +29,17 @@ from mapdata.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 COMPAT_MODES = ("maptrv2", "maptr")
 DEFAULT_RULES = COMPAT_MODES[0]
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
-NO_LANE = -2  # a lane without a neighbour on one side
-OUTSIDE = -1  # a neighbour that is not in the map
+# Values in place of the position of a neighbouring lane.
+NO_LANE = -2  # the lane has no neighbour on this side
+OUTSIDE = -1  # the neighbour is not in the map
 
 
 def check_rules(classes: Collection[str], compat: str) -> None:
     """Check the names of the classes and of the rules.
 
     Args:
-        classes: Class names, out of ``MAP_CLASSES``.
-        compat: Name of the rules, out of ``COMPAT_MODES``.
+        classes: Class names from ``MAP_CLASSES``.
+        compat: Name of the rules, one of ``COMPAT_MODES``.
 
     Raises:
         ValueError: If a class or the rules are unknown.
@@ -159,8 +160,8 @@ class Argoverse2Map:
 
         Args:
             city_from_ego: Transform from the vehicle to the city in metres. (4, 4)
-            classes: Classes to extract, out of ``MAP_CLASSES``.
-            compat: Rules of the ground truth, out of ``COMPAT_MODES``.
+            classes: Classes to extract, from ``MAP_CLASSES``.
+            compat: Rules of the ground truth, one of ``COMPAT_MODES``.
             x_range: Smallest and largest x (forward) in metres, ego frame.
             y_range: Smallest and largest y (left) in metres, ego frame.
 
@@ -186,8 +187,8 @@ class Argoverse2Map:
         """Lines of one class inside the patch, in metres, ego frame. (lines,)
 
         Args:
-            name: Class out of ``MAP_CLASSES``.
-            compat: Rules out of ``COMPAT_MODES``.
+            name: Class, one of ``MAP_CLASSES``.
+            compat: Rules, one of ``COMPAT_MODES``.
             patch: Patch around the vehicle.
             lanes: Positions of the lanes that touch the patch, ascending. (n,)
         """
@@ -196,8 +197,12 @@ class Argoverse2Map:
         if name == "centerline":
             return self._centerlines(patch, lanes)
         if name == "divider":
-            return self._painted_lines(patch) if compat == "maptr" else self._dividers(patch, lanes)
-        return self._crossing_rings(patch) if compat == "maptr" else self._merged_crossings(patch)
+            if compat == "maptr":
+                return self._painted_lines(patch)
+            return self._dividers(patch, lanes)
+        if compat == "maptr":
+            return self._crossing_rings(patch)
+        return self._merged_crossings(patch)
 
     def _dividers(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Lines between neighbouring lanes outside intersections (MapTRv2)."""
@@ -210,14 +215,15 @@ class Argoverse2Map:
         # First, drop the right line of each lane A that is the left neighbour of a lane B.
         is_shared = np.isin(with_right_line, left_neighbours[with_left_line])
         with_right_line = with_right_line[~is_shared]
-        # Links may be one-sided: A names B as its right neighbour, but B names another left
-        # neighbour. Then the right line of A is kept, and the left line of B is dropped.
+        # Two lanes may disagree: A names B as its right neighbour, but B names another lane as its
+        # left neighbour. Then the right line of A is kept, and the left line of B is dropped.
         is_shared = np.isin(with_left_line, right_neighbours[with_right_line])
         with_left_line = with_left_line[~is_shared]
         left_paths, right_paths = self._side_paths
         left_lines = left_paths.simplify_paths(with_left_line.tolist())
         right_lines = right_paths.simplify_paths(with_right_line.tolist())
-        return drop_duplicates(clip_lines(np.concatenate([left_lines, right_lines]), patch))
+        lines = np.concatenate([left_lines, right_lines])
+        return drop_duplicates(clip_lines(lines, patch))
 
     def _centerlines(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Paths along the middle of the lanes (MapTRv2)."""
@@ -229,7 +235,7 @@ class Argoverse2Map:
         return merge_until_stable(clip_lines(self._painted.near(patch), patch))
 
     def _merged_crossings(self, patch: LocalPatch) -> np.ndarray:
-        """Crossings with parallel neighbours united, open at the edge of the patch (MapTRv2)."""
+        """Outlines of crossings, united if parallel, open at the edge of the patch (MapTRv2)."""
         pieces, crossing_of_piece = clip_polygons(self._crossings.near(patch), patch)
         return open_outlines(pieces, crossing_of_piece, patch=patch)
 

@@ -1,4 +1,4 @@
-"""Reader of a log's vector map that checks each element of the file separately."""
+"""Reader of the vector map of an Argoverse 2 log, which checks each map element separately."""
 
 import json
 import math
@@ -39,7 +39,7 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
         path: Map file, ``log_map_archive_*.json``.
 
     Returns:
-        The map, and the ids of the unusable elements, by kind and reason.
+        The map, and the ids of the unusable elements, by a text with their kind and the reason.
 
     Raises:
         ValueError: If the file is damaged, lacks a layer, or a layer has no usable element.

@@ -34,6 +34,7 @@ def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, 
         of the polygon of each piece (pieces,).
     """
     clipped = shapely.intersection(polygons, patch.polygon)
+    # `owner` is the index of the polygon of each piece.
     pieces, owner = shapely.get_parts(clipped, return_index=True)
     is_polygon = (shapely.get_type_id(pieces) == POLYGON) & shapely.is_valid(pieces)
     pieces = patch.to_frame(pieces[is_polygon])
@@ -79,12 +80,13 @@ def _possible_duplicates(bounds: np.ndarray, area: np.ndarray) -> tuple[np.ndarr
         area: Area of each strip in square metres. (n,)
 
     Returns:
-        Index of the first and of the second strip of each pair. The first index is the smaller
-        one, and the pairs are sorted by it. Each (pairs,).
+        Two arrays: indices of the first and of the second strip of each pair. The first index is
+        the smaller one, and the pairs are sorted by it. (pairs,) each
     """
     low = np.maximum(bounds[:, None, :2], bounds[None, :, :2])
     high = np.minimum(bounds[:, None, 2:], bounds[None, :, 2:])
     # Two strips cannot share more than their bounding boxes share, nor more than the smaller strip.
+    # `common` is therefore an upper bound of their intersection, and `union` a lower bound.
     common = np.prod(np.maximum(high - low, 0.0), axis=-1)  # (n, n)
     common = np.minimum(common, np.minimum(area[:, None], area[None]))
     union = area[:, None] + area[None] - common
@@ -94,7 +96,7 @@ def _possible_duplicates(bounds: np.ndarray, area: np.ndarray) -> tuple[np.ndarr
 
 
 def merge_until_stable(lines: np.ndarray) -> np.ndarray:
-    """Cut lines where they meet, and join them at their ends, until their number is stable.
+    """Cut lines where they meet and join them at their ends, until the number of lines is stable.
 
     Args:
         lines: Lines in metres. (n,)

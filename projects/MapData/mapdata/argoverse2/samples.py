@@ -56,7 +56,7 @@ class Argoverse2Options(FileOptions):
         y_range: Smallest and largest y (left) of the ground truth, in metres, ego frame.
 
     Raises:
-        ValueError: If an option is out of its domain, or options contradict each other.
+        ValueError: If an option is out of its range, or options contradict each other.
     """
 
     _: KW_ONLY
@@ -280,9 +280,9 @@ def thin_out(times_ns: np.ndarray, rate_hz: float | None) -> np.ndarray:
     """Select times at a lower rate.
 
     The first time is selected. A later time is selected if its gap to the latest selected one is
-    at least a period of ``rate_hz`` minus half the median gap of ``times_ns``. Because of this
-    tolerance every fourth time of a 10 Hz sensor with jitter is selected at 2.5 Hz, and all times
-    of a sensor slower than ``rate_hz``.
+    at least a period of ``rate_hz`` minus half the median gap of ``times_ns``. This tolerance has
+    two effects: at 2.5 Hz, every fourth time of a 10 Hz sensor with jitter is selected, and all
+    times of a sensor slower than ``rate_hz`` are selected.
 
     Args:
         times_ns: Ascending times in nanoseconds. (n,)
@@ -302,7 +302,7 @@ def thin_out(times_ns: np.ndarray, rate_hz: float | None) -> np.ndarray:
 
 
 class _UnusableSample(Exception):
-    """Error for a sample that cannot be made; its message is a reason to count samples by."""
+    """Error for a sample that cannot be made. Samples are counted by its message, the reason."""
 
 
 def _sample(
@@ -348,7 +348,8 @@ def _cameras(
     """List the images that are closest in time, one for each calibrated camera.
 
     The transforms to the cameras include the motion of the vehicle from the time of the sample to
-    the time of the image. Only samples at rows of the pose table may lack an image of a camera.
+    the time of the image. A camera without an image is left out with ``at="poses:N"``. With other
+    values of ``at`` it makes the sample unusable.
     """
     needs_all_images = options.pose_stride is None
     folder = (log.log_dir / "sensors/cameras").relative_to(options.root).as_posix()
@@ -379,8 +380,9 @@ def _cameras(
 def _lidar(
     log: Argoverse2Log, timestamp_ns: int, ego_from_city: np.ndarray, options: Argoverse2Options
 ) -> LidarRecord | None:
-    """LiDAR sweep closest in time, with earlier sweeps; None if no sweep with a pose is close.
+    """Find the LiDAR sweep closest in time, and the sweeps before it.
 
+    The result is None if no sweep is close enough, or if the closest sweep has no pose.
     Argoverse 2 stores the points of a sweep in the ego frame at the time of the sweep.
     """
     times_ns = log.lidar_timestamps_ns

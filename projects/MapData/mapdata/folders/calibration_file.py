@@ -26,9 +26,10 @@ _CAMERA_KEYS = {
     "images", "intrinsics", "distortion", "distortion_model", "vehicle_from_camera", "position_m",
     "quaternion_wxyz", "yaw_pitch_roll_deg", "size_px",
 }  # fmt: skip
-# A camera's axes (right, down, ahead) in a vehicle's (ahead, left, up).
+# Rotation of a camera that looks ahead: from camera axes (right, down, ahead) to vehicle axes
+# (ahead, left, up).
 _AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-_MOST_BYTES = 300_000  # largest file; YAML takes some milliseconds for a thousand bytes
+_MOST_BYTES = 300_000  # size limit of a file; parsing YAML takes some milliseconds per 1,000 bytes
 _MOST_VALUES = 100_000  # largest number of values in a file
 
 
@@ -109,7 +110,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _refuse_repeats(names: Sequence[Any]) -> None:
-    """Raise a ``ValueError`` if a name repeats, as the values of the first would be lost."""
+    """Raise a ``ValueError`` if a name repeats, because only its last value would be kept."""
     repeats = sorted(str(name) for name, count in Counter(names).items() if count > 1)
     if repeats:
         raise InputError(f"{', '.join(repeats)} is there twice: remove or rename one")
@@ -134,7 +135,9 @@ def _read_values(file: Path) -> Any:
     except yaml.YAMLError as error:
         raise InputError(f"it is no YAML: {error}") from error
     values = [content]
-    for value in values:  # the list grows; aliases of YAML can repeat a value many times
+    # The list grows during the loop by the values inside of each value. YAML aliases can repeat a
+    # value many times, so the number is limited.
+    for value in values:
         if isinstance(value, dict):
             values += value.values()
         elif isinstance(value, list):
@@ -145,7 +148,7 @@ def _read_values(file: Path) -> Any:
 
 
 def read_calibration(file: Path) -> dict[str, Any]:
-    """Read the content of a calibration file; the keys of its cameras are not yet checked.
+    """Read the content of a calibration file. The keys of its cameras are not checked.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -237,7 +240,7 @@ def create_camera(
 
 
 def _size_of(images: Sequence[Path], where: str) -> tuple[int, int]:
-    """Size of the first image that can be read; without any, the error of the last is raised."""
+    """Size of the first readable image. If there is none, the error of the last image is raised."""
     for path in images[:-1]:
         with suppress(ValueError):
             return image_size(path, where)
@@ -245,7 +248,7 @@ def _size_of(images: Sequence[Path], where: str) -> tuple[int, int]:
 
 
 def _vehicle_from_camera(camera: Mapping[str, Any]) -> np.ndarray:
-    """Pose of a camera (right, down, ahead) on the vehicle (ahead, left, up), in metres. (4, 4)"""
+    """Transform from a camera (right, down, ahead) to the vehicle (ahead, left, up). (4, 4)"""
     keys = {"vehicle_from_camera", "quaternion_wxyz", "yaw_pitch_roll_deg"} & set(camera)
     if len(keys) != 1:
         raise InputError(

@@ -53,8 +53,8 @@ def read_image_folder(
     Args:
         file: Calibration file, YAML or JSON. Its paths are relative to its folder.
         frames_dir: Folder for rectified images, which are written if a camera has distortion. They
-            lie in a folder that is named by a digest of the images and the calibration.
-        trained: Width, height, fx, fy, cx and cy of the cameras that images are rectified to, by
+            are in a subfolder, whose name has a digest of the images and the calibration.
+        trained: Width, height, fx, fy, cx and cy of the cameras to which images are rectified, by
             name (``InputOptions``).
 
     Returns:
@@ -108,7 +108,11 @@ def read_image_folder(
 
 
 def _read_timing(content: Mapping[str, Any]) -> tuple[float | None, int]:
-    """Rate in Hz (None if the file has none) and tolerance in ns of a calibration file."""
+    """Read the rate of the images and the tolerance of their times from a calibration file.
+
+    Returns:
+        Rate in Hz, None if the file has none, and tolerance in nanoseconds.
+    """
     rate_hz = float(content["rate_hz"]) if "rate_hz" in content else None
     tolerance_ns = round(float(content.get("max_time_difference_ms", 50.0)) * 1e6)
     is_rate_valid = rate_hz is None or 0 < rate_hz < np.inf
@@ -118,9 +122,10 @@ def _read_timing(content: Mapping[str, Any]) -> tuple[float | None, int]:
 
 
 def _digest(file: Path, frames: Sequence[RigFrame], target_key: bytes) -> str:
-    """Digest of a calibration file, the images of frames, and the key of the rectification targets.
+    """Digest of a calibration file, of the images of frames and of ``target_key``.
 
-    The key is the result of `set_rectification_targets`.
+    ``target_key`` is the result of `set_rectification_targets`. It depends on the cameras to which
+    images are rectified.
     """
     digest = hashlib.sha256(file.read_bytes() + target_key)
     for frame in frames:
@@ -133,9 +138,12 @@ def _digest(file: Path, frames: Sequence[RigFrame], target_key: bytes) -> str:
 def _find_images(
     folder: Path, name: str, camera: Mapping[str, Any]
 ) -> tuple[list[Path], list[str]]:
-    """Images of a camera in natural order of their names, with a note on files of other types.
+    """Find the images of a camera, in natural order of their names (2 before 10).
 
     Hidden files are ignored.
+
+    Returns:
+        The images, and a note if there are files of other types.
     """
     pattern = str(camera.get("images", name))
     place = path_below(folder, pattern, noun="images")
@@ -173,7 +181,7 @@ def _find_images(
 
 
 def _simplify_pattern(pattern: str) -> str:
-    """Reduce successive ``**`` of a pattern to one, and refuse more than `_MOST_ANY` in all."""
+    """Reduce successive ``**`` of a pattern to one; more than `_MOST_ANY` in all are an error."""
     parts: list[str] = []
     for part in Path(pattern).parts:
         is_repeat = part == "**" and parts[-1:] == ["**"]
@@ -195,7 +203,9 @@ def _group_images(
         The frames, the time of each file name that has one, and notes on assumptions.
     """
     scene = folder.resolve().name
-    stems = {path.stem for paths in images.values() for path in paths}
+    stems: set[str] = set()
+    for paths in images.values():
+        stems.update(path.stem for path in paths)
     time_of = times_of_names(stems)
     if time_of is not None:
         return _group_by_times(
@@ -215,8 +225,8 @@ def _group_images(
     rate = rate_hz or _RATE_HZ
     first_images = next(iter(images.values()))
     time_of = {}
-    # An entry has the path and the time in nanoseconds of the image of each camera. Its key is the
-    # name of these images without suffix.
+    # Path and time in nanoseconds of the image of each camera, by the name of the camera. The outer
+    # key is the common name of these images without suffix.
     images_by_stem: dict[str, dict[str, tuple[str, int]]] = {}
     for i, path in enumerate(first_images):
         time_of[path.stem] = round(i * 1e9 / rate)
@@ -245,7 +255,7 @@ def _group_by_times(
 ) -> tuple[list[RigFrame], dict[str, int], list[str]]:
     """Group the images of all cameras around the times of the first camera."""
     scene = folder.resolve().name
-    path_at: dict[str, dict[int, str]] = {}
+    path_at: dict[str, dict[int, str]] = {}  # path of the image of a camera at a time
     times_ns = {}
     for name, paths in images.items():
         path_at[name] = {time_of[path.stem]: path.relative_to(folder).as_posix() for path in paths}
@@ -300,7 +310,7 @@ def _usage_notes(
 def _frames_with_poses(
     frames: Sequence[RigFrame], poses: PoseTrack, pose_at: PoseAt
 ) -> tuple[list[RigFrame], list[str]]:
-    """Select the frames with a pose, with a note on the others.
+    """Select the frames with a pose, and make a note on the others.
 
     Raises:
         ValueError: If no frame has a pose.
@@ -325,7 +335,7 @@ def _frames_with_poses(
 def _rectify_images(
     sample: MapSample, rig: Sequence[RigCamera], root: Path, target: Path
 ) -> list[str]:
-    """Write the images of a sample without distortion, and change the paths of its cameras.
+    """Rectify the images of a sample, write them, and set the paths of its cameras to them.
 
     Images that cannot be read are not written, so that reading the sample fails.
 

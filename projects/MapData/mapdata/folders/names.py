@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mapdata.unix_times import unix_time_ns
 
-# The last digits of a name, as a whole number of 10, 13, 16 or 19 digits, and a fraction.
+# Digits at the end of a name: a whole number of 10, 13, 16 or 19 digits, and an optional fraction.
 _TIME = re.compile(r"(?:^|\D)(\d{10}(?:\d{3}|\d{6}|\d{9})?)(?:\.(\d{1,9}))?$")
 # Year, month, day and hour, such as 2023100512. They may be followed by the minutes, and these by
 # the seconds with the digits of their fraction.
@@ -24,14 +24,15 @@ def natural_sort_key(path: Path) -> list[str | int]:
 def times_of_names(stems: Collection[str]) -> dict[str, int] | None:
     """Parse the Unix times at the ends of file names.
 
-    A time has 10 digits (s), 13 (ms), 16 (us) or 19 (ns), or is in seconds with a fraction, and
-    lies in the years 2000 to 2099. If all names read as dates, none is taken as a time.
+    A time has 10 digits (s), 13 (ms), 16 (us) or 19 (ns), or is in seconds with a fraction. It is
+    in the years 2000 to 2099. If the numbers of all names can be read as dates, such as 2023100512,
+    none of them is taken as a time.
 
     Args:
         stems: File names without their suffixes.
 
     Returns:
-        Times in nanoseconds by name; None unless all names have one.
+        Times in nanoseconds by name; None if a name has no time.
     """
     times = {}
     are_dates = True

@@ -21,15 +21,15 @@ _FRAME = "frame"
 _SEPARATORS = ",;\t"
 _NUMBER = re.compile(r"(-?\d+)(\.0*)?")
 _LENGTH_TOLERANCE = 1e-2  # largest difference of a quaternion's length from 1
-_MOST_COLUMNS = 12  # number of columns that a message names
+_MOST_COLUMNS = 12  # largest number of columns that a message names
 
 
 def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> PoseTrack:
     """Read poses from the columns x, y, z, qw, qx, qy, qz, and timestamp_ns or frame.
 
-    The column ``frame`` holds names of images. Columns are separated by commas, semicolons or tabs,
-    and blanks around values are ignored. In files with semicolons or tabs, numbers may have decimal
-    commas.
+    The column ``frame`` has the names of images, whose times are the times of the poses. Columns
+    are separated by commas, semicolons or tabs, and blanks around values are ignored. In files with
+    semicolons or tabs, numbers may have decimal commas.
 
     Args:
         path: Text file, whose first line names the columns.
@@ -79,6 +79,7 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
 def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield the number and the values by column of each line below the first."""
     lines = text.splitlines()
+    # Index of the first line that is not blank.
     start = next((number for number, line in enumerate(lines) if line.strip()), None)
     if start is None:
         raise InputError("it is empty")
@@ -91,7 +92,7 @@ def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
             values = [value.strip() for value in row]
             if not any(values):
                 continue
-            number = start + table.line_num  # the table counts its lines from 1
+            number = start + table.line_num  # `line_num` is 1 in the line with the names
             if len(values) < len(names):
                 raise InputError(f"line {number}: it has {len(values)} of {len(names)} columns")
             if separator != ",":
@@ -116,6 +117,7 @@ def _require_columns(names: Collection[str]) -> None:
 def _time_of(row: Mapping[str, str], time_of: Mapping[str, int]) -> int | None:
     """Time of a row in nanoseconds; None if no image has the name in the row."""
     if _FRAME in row:
+        # The name of an image, without or with its suffix.
         name = row[_FRAME]
         return time_of.get(name, time_of.get(Path(name).stem))
     text = row[_TIME]
@@ -130,7 +132,7 @@ def _time_of(row: Mapping[str, str], time_of: Mapping[str, int]) -> int | None:
 
 
 def _pose_of(row: Mapping[str, str]) -> list[float]:
-    """Position and quaternion (w, x, y, z) of a row. 7 values"""
+    """Position (x, y, z) in metres and quaternion (w, x, y, z) of a row: 7 numbers."""
     values = []
     for name in _VALUES:
         try:

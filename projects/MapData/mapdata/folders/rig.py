@@ -45,8 +45,8 @@ class RigCamera:
             images. None rectifies them to ``intrinsics``.
 
     Raises:
-        ValueError: If the size is not positive, or images cannot be rectified with such
-            coefficients.
+        ValueError: If the size is not positive, or images cannot be rectified with the given
+            distortion.
     """
 
     name: str
@@ -102,7 +102,7 @@ class RigCamera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether images must be rectified before a model takes them."""
+        """Whether images must be rectified before they are given to a model."""
         return bool(np.any(self.distortion))
 
     def _covered_share(self) -> float:
@@ -183,10 +183,11 @@ class PoseTrack:
         times_ns: Times of the poses, in any order. Among poses of equal times, the first is used.
             (n,)
         poses: Transforms from the vehicle to the global frame, in metres. (n, 4, 4)
-        gap_ns: Longest gap between two poses in which poses are interpolated. The first pose also
-            holds for a tenth of this time before it, and the last pose for a tenth after it.
-        holds: Whether, in a gap longer than ``gap_ns``, the pose before the gap holds until the
-            next pose, and the last pose holds for ever.
+        gap_ns: Longest gap between two poses in which poses are interpolated. The first pose is
+            also used up to a tenth of this time earlier, and the last pose up to a tenth of this
+            time later.
+        holds: Whether poses are kept. If True, the pose before a gap longer than ``gap_ns`` is used
+            in the whole gap, and the last pose is used at all later times.
 
     Raises:
         ValueError: If there is no pose, or a pose is not finite.
@@ -305,7 +306,8 @@ def rig_samples(
             path, time_ns = frame.images[camera.name]
             image_pose = None if pose_at is None else pose_at(time_ns)
             cam_from_ground = camera.cam_from_ground
-            if image_pose is not None and pose is not None:  # the vehicle moves in between
+            # The vehicle moves between the time of the frame and the time of the image.
+            if image_pose is not None and pose is not None:
                 cam_from_ground = cam_from_ground @ invert_rigid(image_pose) @ pose
             width, height = camera.size_px
             record = CameraRecord(

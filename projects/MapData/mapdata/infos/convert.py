@@ -40,8 +40,9 @@ from mapdata.summary import ConversionSummary
 from mapdata.unix_times import in_nanoseconds
 
 NUSCENES_SIZE = (1600, 900)  # width and height of the images in pixels
-_RING_SIZE = (2048, 1550)  # width and height of the images of Argoverse 2
-_RING_FRONT_SIZE = (1550, 2048)  # for its front camera, which is mounted upright
+_RING_SIZE = (2048, 1550)  # width and height of the images of Argoverse 2's ring cameras in pixels
+_RING_FRONT_SIZE = (1550, 2048)  # for the front camera, which is mounted upright
+# Fields that a sample must have, by annotation frame, for messages.
 _NEEDED = {
     "lidar": "token, timestamp, lidar_path, lidar2ego_* and ego2global_* (translation, rotation), "
     "and cams with data_path, cam_intrinsic and sensor2lidar_*",
@@ -74,7 +75,7 @@ def _relative(path: str, root: Path) -> str:
 
 
 def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance] | None:
-    """Ground truth of an entry; None if the entry has no ground truth.
+    """Ground truth of an entry of an info file; None if the entry has none.
 
     Lines of one point are left out.
     """
@@ -94,7 +95,7 @@ class _ImageSizes:
     """Image sizes of a nuScenes info file, read once per scene and camera.
 
     Args:
-        summary: Counts the missing images, for which the size of nuScenes' images is assumed.
+        summary: Summary that counts missing images. The usual size in nuScenes is assumed for them.
     """
 
     def __init__(self, summary: ConversionSummary) -> None:
@@ -198,6 +199,7 @@ def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path)
             width=width,
             height=height,
             intrinsics=intrinsics,
+            # From the vehicle at the sample, through the global frame, to the vehicle at the image.
             cam_from_frame=cam_from_ego @ ego_at_image_from_global @ global_from_ego,
         )
         cameras.append(record)
@@ -223,8 +225,8 @@ def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
     Returns:
         The entries, and the annotation frame: ``lidar`` (nuScenes) or ``ego`` (Argoverse 2).
     """
-    # Samples of StreamMapNet and MapTracker also have the key ``e2g_translation``. They are listed
-    # under ``samples``, or the whole content is the list.
+    # Samples of StreamMapNet and MapTracker also have the key ``e2g_translation``, but lack other
+    # keys of MapTRv2. They are listed under ``samples``, or the whole content is the list.
     entries = content.get("samples", ()) if isinstance(content, Mapping) else content
     first = entries[0] if isinstance(entries, list) and entries else None
     if isinstance(first, Mapping) and "e2g_translation" in first and not first.keys() >= _MAPTRV2:
@@ -260,10 +262,10 @@ def _samples(
 
     Args:
         entries: Entries of the info file with their position in it.
-        meta: Description of the annotation file.
+        meta: Metadata of the annotation file.
         infos: Path of the info file, for messages.
         root: Data root.
-        summary: Counts the samples and problems.
+        summary: Summary that counts the samples and problems.
     """
 
     @cache
@@ -343,11 +345,11 @@ def convert_infos(
             from it.
         split: Name of the split.
         classes: Class names in label order.
-        x_range: Smallest and largest x of the ground truth in metres, annotation frame; None is the
-            usual range of the frame.
-        y_range: Smallest and largest y of the ground truth in metres, annotation frame; None is the
-            usual range of the frame.
-        command: Command line, for messages of readers of the file.
+        x_range: Smallest and largest x of the ground truth in metres in the annotation frame; None
+            for the usual range of the frame.
+        y_range: Smallest and largest y of the ground truth in metres in the annotation frame; None
+            for the usual range of the frame.
+        command: Command line that creates the file, for messages of readers of the file.
         shard: Part of the samples to convert.
 
     Returns:
@@ -355,8 +357,8 @@ def convert_infos(
 
     Raises:
         FileNotFoundError: If the info file is missing.
-        ValueError: If the info file holds more than plain data, has an unknown form, or has ground
-            truth outside the range.
+        ValueError: If the info file contains more than plain data, has an unknown form, or has
+            ground truth outside the range.
     """
     entries, frame = _entries(load_plain_pickle(infos), infos)
     with explain_errors(infos, "make it again"):

@@ -1,4 +1,4 @@
-"""Reader of pickles of plain data that never imports or calls a name from the file."""
+"""Reader of pickles of plain data. It never imports or calls a function that a file names."""
 
 import pickle
 import struct
@@ -13,8 +13,8 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.numpy_pickle import CHECKED, CheckedArray, CheckedDtype
 
 # Substitutes of functions and classes, by their name in a pickle. `CHECKED` has the substitutes of
-# numpy, which check what they are given. The substitutes of containers take no arguments, so they
-# can only create empty ones.
+# numpy, which check their arguments. The other substitutes take no arguments, so they can only
+# create empty containers.
 _STAND_INS: dict[str, Callable[..., Any]] = {
     **CHECKED,
     "collections.OrderedDict": lambda: {},
@@ -36,10 +36,10 @@ _DAMAGE = (
 
 
 class _PlainUnpickler(pickle._Unpickler):
-    """Unpickler of the standard library without the opcodes that call functions or make objects.
+    """Unpickler of the standard library without the opcodes that make objects.
 
-    The methods below stand for opcodes. They check the types of the values on the stack, which a
-    malicious file could choose.
+    Functions and classes are replaced by harmless substitutes. Most methods below implement an
+    opcode. They check the types of the values on the stack, which a malicious file could choose.
     """
 
     stack: list[Any]
@@ -115,10 +115,10 @@ class _PlainUnpickler(pickle._Unpickler):
 
 
 def _key(value: Any) -> Hashable:
-    """Check a key of a dict or set, and return it.
+    """Check a key of a dict or an element of a set, and return it.
 
-    Wide integers and tuples with floats are rejected: an attacker can give them equal hashes, and
-    building a dict of such keys takes quadratic time.
+    Wide integers and tuples with floats are rejected: an attacker can choose many of them with
+    equal hashes, and building a dict of such keys takes quadratic time.
     """
     parts = value if isinstance(value, tuple) else (value,)
     for part in parts:
@@ -146,7 +146,7 @@ def _count(value: Any, counts: dict[int, int], depth: int = 0) -> int:
 
     Args:
         value: Value or container.
-        counts: Numbers of values by ``id`` of the container, 0 while it is being counted.
+        counts: Number of values of each container, by its ``id``; 0 while it is being counted.
         depth: Number of enclosing containers.
 
     Raises:

@@ -79,27 +79,28 @@ def _matrix(values: Any, size: int, name: str) -> np.ndarray:
 
 
 def find_file(name: str, root: Path) -> Path | None:
-    """Find the longest suffix of a path that is a file below a folder.
+    """Find the longest end of a path that is the path of a file below a folder.
 
-    Suffixes with ``..`` may lead out of the folder, and are left out.
+    For ``/data/samples/a.jpg``, the ends are ``data/samples/a.jpg``, ``samples/a.jpg`` and
+    ``a.jpg``. Ends with ``..`` may lead out of the folder, and are left out.
 
     Args:
         name: Path, possibly absolute and from another computer.
         root: Folder.
 
     Returns:
-        The suffix, relative to ``root``; None if no suffix is a file.
+        The end of the path, relative to ``root``; None if no end is a file.
     """
     parts = [part for part in Path(name.replace("\\", "/")).parts if part != "/"]
     for start in range(len(parts)):
-        suffix = Path(*parts[start:])
-        if ".." not in suffix.parts and (root / suffix).is_file():
-            return suffix
+        end = Path(*parts[start:])
+        if ".." not in end.parts and (root / end).is_file():
+            return end
     return None
 
 
 def _locate(name: str, folder: str, root: Path, owner: str) -> Path:
-    """Find a file by its path or in a folder of nuScenes.
+    """Find a file by its path (`find_file`), or by its name in a folder of nuScenes.
 
     Args:
         name: Path of the file.
@@ -159,12 +160,12 @@ def _sample(info: Mapping[str, Any], root: Path, where: str, allow_missing: bool
     cameras = _cameras(info["images"], root, where=where, allow_missing=allow_missing)
     ego_from_lidar = _matrix(lidar["lidar2ego"], size=4, name=f"{where}: lidar2ego")
     global_from_ego = _matrix(info["ego2global"], size=4, name=f"{where}: ego2global")
-    # A time that is no Unix time is in seconds.
+    # A number that is not recognised as a Unix time is taken as seconds.
     timestamp_ns = in_nanoseconds(info["timestamp"], usual_unit_ns=10**9)
-    record = None
+    lidar_record = None
     if lidar.get("lidar_path"):
         path = _locate(lidar["lidar_path"], "LIDAR_TOP", root=root, owner=f"{where}, LiDAR")
-        record = LidarRecord(path.as_posix(), frame_from_lidar=np.eye(4))
+        lidar_record = LidarRecord(path.as_posix(), frame_from_lidar=np.eye(4))
     return MapSample(
         token=str(info.get("token", info.get("sample_idx", where))),
         scene=str(info.get("scene_token", "")),
@@ -173,5 +174,5 @@ def _sample(info: Mapping[str, Any], root: Path, where: str, allow_missing: bool
         cameras=cameras,
         global_from_frame=global_from_ego @ ego_from_lidar,
         ego_from_frame=ego_from_lidar,
-        lidar=record,
+        lidar=lidar_record,
     )

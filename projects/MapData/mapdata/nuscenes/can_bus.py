@@ -26,12 +26,12 @@ def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Message
         messages: Messages of the scene (`read_messages`).
 
     Returns:
-        Signals in the order of ``pose_signals``; the measured ones are 0 without an earlier
-        message. (18,)
+        Signals in the order of ``pose_signals``. If there is no message at or before the time,
+        acceleration, rotation rate and velocity are 0. (18,)
     """
     signals = pose_signals(global_from_ego)
     times_us, measurements = messages
-    # The latest message at or before the time counts. Its index is -1 if there is none.
+    # Index of the latest message at or before the time; -1 if there is no such message.
     latest = int(np.searchsorted(times_us, timestamp_ns // 1000, side="right")) - 1
     if latest >= 0:
         signals[7:16] = measurements[latest]  # after the position (3) and the quaternion (4)
@@ -72,7 +72,7 @@ def read_messages(dataroot: Path, scene: str) -> Messages:
 
 
 def _is_unreliable(scene: str, dataroot: Path) -> bool:
-    """Whether a scene is one of nuScenes whose signals the devkit rejects."""
+    """Whether a scene is a nuScenes scene whose signals the devkit rejects."""
     from nuscenes.can_bus.can_bus_api import NuScenesCanBus
 
     number = _NUSCENES_SCENE.fullmatch(scene)

@@ -130,8 +130,8 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
             )
         for part in _OFFICIAL_SPLITS[version_name]:
             scenes[part] = official[part]
-    # The identity is computed from these three splits for every version. The splits of the mini
-    # version are parts of them.
+    # For every version, the identity is computed from these three splits. The splits of the mini
+    # version are subsets of them.
     all_scenes = {part: official[part] for part in ("train", "val", "test")}
     return SplitList(OFFICIAL, scenes), list_identity(OFFICIAL, all_scenes)
 
@@ -139,7 +139,7 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
 def _resolve_splits(
     split_list: SplitList, options: NuScenesOptions, scenes: list[_Scene]
 ) -> tuple[dict[str, str], list[str]]:
-    """Find the part of the list of splits, such as ``train``, to which each scene belongs.
+    """Find the part of the split list, such as ``train``, to which each scene belongs.
 
     Returns:
         Part by name of the scene, and a note if scenes of the list are missing in the data set.
@@ -189,7 +189,7 @@ def _map_names(scene_of_version: _Scene) -> tuple[str, str]:
 
 
 def _count_samples(scenes: list[_Scene]) -> int:
-    """Number of samples of all scenes, by their records."""
+    """Number of samples of all scenes, as given in the records of the scenes."""
     return sum(scene["nbr_samples"] for scene, _ in scenes)
 
 
@@ -383,8 +383,8 @@ def _source_fingerprint(options: NuScenesOptions) -> str:
         contents.append(folder / "scene.json")
         for path in sorted(folder.glob("*.json")):
             if not is_hidden(path):
-                # Several versions have tables of equal names. Those of the first version have no
-                # prefix, so that the digest of a single version does not depend on its folder.
+                # Several versions have tables of equal names. The tables of the first version have
+                # no prefix, so that the digest of a single version does not depend on its folder.
                 is_first = version_name == options.versions[0]
                 name = path.name if is_first else f"{folder.name}/{path.name}"
                 sizes[name] = path.stat().st_size

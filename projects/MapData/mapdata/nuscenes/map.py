@@ -1,7 +1,7 @@
 """Local vector maps from a nuScenes map expansion, by the rules of MapTR.
 
-Geometry that does not depend on the pose of the vehicle is prepared once per map; each frame then
-takes a few vectorised geometry calls on the elements near the vehicle.
+Geometry that does not depend on the pose of the vehicle is prepared once per map. Each frame then
+needs only a few vectorised geometry calls on the elements near the vehicle.
 """
 
 from collections import Counter
@@ -50,7 +50,7 @@ CENTERLINE_STEP_M = 0.5  # distance between the points of a centre line
 
 @dataclass
 class MapLayers:
-    """Geometries of one map in metres, global frame. They can be sent to another process.
+    """Geometries of one map in metres, global frame. They can be pickled for another process.
 
     Args:
         lines: Dividers.
@@ -102,7 +102,7 @@ def check_classes(classes: Collection[str]) -> None:
 
 
 def expansion(root: Path, name: str) -> Path:
-    """Path of a map's file below a data root."""
+    """Path of the expansion file of a map, below a data root."""
     return root / f"maps/expansion/{name}.json"
 
 
@@ -161,7 +161,7 @@ def maps_in(root: Path) -> list[str]:
 def _open_map(root: Path, name: str) -> "NuScenesMap":
     """Open a map with the devkit.
 
-    The devkit only accepts the locations in its list, so the name is added to the list meanwhile.
+    The devkit only accepts the locations in its list, so the name is in the list while it opens.
     """
     from nuscenes.map_expansion.map_api import NuScenesMap, locations
 
@@ -285,6 +285,7 @@ class NuScenesLocalMap:
             lines = patch.lines_inside(long_edges(near))
             return vertices_of(patch.to_local(lines), dim=2)
         clipped = shapely.intersection(near, patch.polygon)
+        # `owner` is the index of the crossing of each piece.
         pieces, owner = shapely.get_parts(clipped, return_index=True)
         is_polygon = shapely.get_type_id(pieces) == POLYGON
         polygons = patch.to_local(pieces[is_polygon])

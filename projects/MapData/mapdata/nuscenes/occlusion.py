@@ -148,9 +148,8 @@ def _in_image(points: Array, camera: CameraRecord) -> NDArray[np.bool_]:
 def hidden_share(sample: MapSample, boxes: Boxes) -> float:
     """Compute the share of a sample's map that boxes hide.
 
-    The share is taken of the map points inside at least one image. A point is hidden if, for each
-    camera whose image contains the point, a box intersects the line of sight from the camera to the
-    point.
+    Only map points inside at least one image are counted. A point is hidden if, for each camera
+    whose image contains the point, a box intersects the line of sight from the camera to the point.
 
     Args:
         sample: Sample with cameras and ground truth. Elements without heights are placed on the
@@ -170,11 +169,14 @@ def hidden_share(sample: MapSample, boxes: Boxes) -> float:
     is_visible = np.zeros(len(points), dtype=bool)
     for camera in sample.cameras:
         inside = np.flatnonzero(_in_image(points, camera))
-        origin = (global_from_frame @ invert_rigid(camera.cam_from_frame))[:3, 3]
+        global_from_cam = global_from_frame @ invert_rigid(camera.cam_from_frame)
+        origin = global_from_cam[:3, 3]
         is_in_image[inside] = True
         is_hidden = cuts_sight(origin, global_points[inside], boxes=boxes).any(axis=1)
         is_visible[inside] |= ~is_hidden
-    return float((is_in_image & ~is_visible).sum() / max(is_in_image.sum(), 1))
+    num_hidden = (is_in_image & ~is_visible).sum()
+    num_in_image = is_in_image.sum()
+    return float(num_hidden / max(num_in_image, 1))
 
 
 def word_for(share: float, limits: Sequence[int] = LIMITS) -> str:

@@ -1,4 +1,4 @@
-"""Tables of nuScenes-format data, reduced to the records of cameras and LiDAR, and samples."""
+"""Reader of nuScenes tables, which makes samples from the records of cameras and LiDAR."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,8 +22,8 @@ CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 )  # fmt: skip
 LIDAR = "LIDAR_TOP"
-# Fields that are read from each table. The value is the type of the field or, for a list of
-# numbers, its length (`_has_kind`).
+# Fields that are read from each table, with their kinds (`_has_kind`). The kind of a list of
+# numbers is its length; the kind of any other field is its type.
 _POSE: dict[str, type | int] = {"translation": 3, "rotation": 4}
 _FIELDS: dict[str, dict[str, type | int]] = {
     "sensor": {"channel": str},
@@ -39,7 +39,7 @@ _FIELDS: dict[str, dict[str, type | int]] = {
     },
     "sample_annotation": {"sample_token": str, "size": 3, **_POSE},
 }  # fmt: skip
-# Fields that hold the token of a record of another table, with the name of this table.
+# Fields that contain the token of a record of another table, with the name of the other table.
 _LINKS = {
     "calibrated_sensor": {"sensor_token": "sensor"},
     "scene": {"log_token": "log", "first_sample_token": "sample"},
@@ -53,9 +53,9 @@ _LINKS = {
 def _has_kind(value: Any, kind: type | int) -> bool:
     """Whether a value has the type of a field, or is a list of ``kind`` finite numbers.
 
-    A ``list`` is a matrix of camera intrinsics (3, 3), or empty for other sensors. An integer must
-    fit into 64 bits after a conversion from microseconds to nanoseconds. Four numbers are a unit
-    quaternion.
+    The kind ``list`` is a matrix of camera intrinsics (3, 3), or an empty list for other sensors.
+    An integer must fit into 64 bits after a conversion from microseconds to nanoseconds. Four
+    numbers must be a unit quaternion.
     """
     if kind is list:
         if type(value) is not list:
@@ -135,16 +135,20 @@ def read_table(folder: Path, table: str) -> Iterator[dict[str, Any]]:
 class NuScenesTables:
     """Tables of one version: key frames of cameras and LiDAR and, on request, LiDAR sweeps.
 
-    Annotation tables and the records of other sensors are not kept. Of the 2.6 million
-    ``sample_data`` records of ``v1.0-trainval`` a tenth remains (a fifth with sweeps), with the
-    poses that they refer to. The field ``data`` of a sample holds the records of its key frames by
-    channel.
+    Annotation tables and the records of other sensors are not kept. This leaves a tenth of the 2.6
+    million ``sample_data`` records of ``v1.0-trainval`` (a fifth with sweeps), and the poses that
+    they refer to. The field ``data`` of a sample contains the records of its key frames by channel.
 
     Args:
         version: Name of the folder of the tables, such as ``v1.0-trainval``.
         dataroot: Data root.
         max_sweeps: Number of earlier LiDAR sweeps per sample.
         frame: Annotation frame, ``lidar`` or ``ego``.
+
+    Attributes:
+        cameras: Channels of the cameras, the six of nuScenes first.
+        lidar: Channel of the LiDAR.
+        scene: Records of all scenes.
 
     Raises:
         FileNotFoundError: If a table is missing.
@@ -200,12 +204,14 @@ class NuScenesTables:
     def _sensor_channels(self) -> tuple[tuple[str, ...], str]:
         """Find the channels of the cameras and the LiDAR.
 
+        The LiDAR is LIDAR_TOP. With the frame ``ego``, it may have another name if it is the only
+        LiDAR.
+
         Returns:
             Channels of the cameras, the six of nuScenes first, and the channel of the LiDAR.
 
         Raises:
-            ValueError: If there is no LIDAR_TOP and no LiDAR to take its place. Only with the frame
-                ``ego``, a LiDAR of another name takes its place, if there is exactly one.
+            ValueError: If there is no such LiDAR.
         """
         sensors = self._records["sensor"]
         camera_channels = set()
@@ -231,7 +237,7 @@ class NuScenesTables:
     def _read_sample_data(self) -> Iterator[dict[str, Any]]:
         """Yield the key frames of cameras and LiDAR and, on request, LiDAR sweeps.
 
-        A record is reduced to the checked fields.
+        Records are reduced to the fields that `read_table` checks.
         """
         key_frame_channels = {self.lidar, *self.cameras}
         names = ("token", *_FIELDS["sample_data"])

@@ -1,4 +1,4 @@
-"""Conversion of logs of py123d to an annotation file (pinhole cameras, frame ``ego``)."""
+"""Conversion of py123d logs to an annotation file with pinhole cameras and the frame ``ego``."""
 
 import argparse
 import itertools
@@ -35,10 +35,10 @@ class Py123dOptions(FileOptions):
         split: Folder of the logs below ``root/logs``, such as ``nuscenes_val``.
         data_root: Folder that the image paths in logs are relative to; None for ``root``. Images
             whose content is stored in the logs are written to files in this folder.
-        rate_hz: Samples per second; None keeps all frames.
-        logs: Names, or first characters of names, of the logs to convert; empty converts all.
-        ground_z_m: Height of the road in the frame of the rear axle, in metres; None takes the
-            bottom of the vehicle's box.
+        rate_hz: Samples per second; None for all frames.
+        logs: Names, or first characters of names, of the logs to convert; empty for all logs.
+        ground_z_m: Height of the road in the frame of the rear axle, in metres; None for the bottom
+            of the vehicle's box.
         x_range: Smallest and largest x (forward) of the ground truth, in metres.
         y_range: Smallest and largest y (left) of the ground truth, in metres.
     """
@@ -75,7 +75,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
     for folder in _find_logs(options):
         try:
             log = Log(folder)
-            # Reads the table of poses, so that a log without a valid one is left out here.
+            # This access reads the table of poses, so a log without a valid table is left out here.
             log.ground_z_m  # noqa: B018
             logs.append(log)
         except (FileNotFoundError, ValueError) as error:
@@ -156,7 +156,7 @@ def _all_records(
     logs: Progress, options: Py123dOptions, summary: ConversionSummary
 ) -> Iterator[dict[str, Any]]:
     """Yield the records of all logs; a log that cannot be read is left out."""
-    # Only the latest map is kept, as the logs of a town follow each other.
+    # Only the latest map is kept, because the logs of a town are consecutive.
     maps: dict[Path, Map] = {}
     for log in logs:
         try:
@@ -180,8 +180,9 @@ def _records(
     log: Log, log_map: Map | None, options: Py123dOptions, summary: ConversionSummary
 ) -> Iterator[dict[str, Any]]:
     """Yield the records of a log; frames that cannot be used are counted and left out."""
-    frames = {}  # by time in nanoseconds: the row of the image in the table of each camera
-    for time_ns, rows in log.frames():  # a camera without an image has None
+    # For each time in nanoseconds, the row of the image in the table of each camera.
+    frames = {}
+    for time_ns, rows in log.frames():  # the row is None for a camera without an image
         if not rows:
             raise InputError("it has no camera that can be used")
         known_rows = {name: row for name, row in rows.items() if row is not None}
@@ -223,7 +224,7 @@ def _records(
 def _cameras(
     log: Log, rows: Mapping[str, int], global_from_axle: np.ndarray, root: Path
 ) -> list[dict[str, Any]]:
-    """List the cameras of a frame, as `mapdata.custom.from_records` takes them.
+    """List the cameras of a frame in the form that `mapdata.custom.from_records` reads.
 
     The transforms to the cameras include the motion of the vehicle between the time of the frame
     and the time of each image.

@@ -1,4 +1,4 @@
-"""Logs of py123d: times, poses of the vehicle, and cameras."""
+"""Logs (recorded drives) of py123d: times, poses of the vehicle, and cameras."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -30,8 +30,8 @@ def pose_of(values: Any) -> np.ndarray:
     """Transform of a pose of py123d: x, y, z in metres and the quaternion w, x, y, z. (4, 4)
 
     Raises:
-        ValueError: If there are not 7 numbers, one is not finite, or the quaternion has another
-            length than 1.
+        ValueError: If there are not 7 numbers, one is not finite, or the quaternion is not a unit
+            quaternion.
     """
     numbers = np.array(values, dtype=np.float64)
     if numbers.shape != (7,) or not np.isfinite(numbers).all():
@@ -75,13 +75,13 @@ class Camera:
 
     @property
     def fault(self) -> str:
-        """Fault of the camera; empty for a pinhole camera with images."""
+        """Reason why the camera cannot be used; empty for a pinhole camera with images."""
         model = self.metadata.get("camera_model")
         if model != "pinhole":
             return f"its model is {model!r:.40}, not 'pinhole'"
         if self.metadata.get("intrinsics") is None:
             return "it has no intrinsics"
-        # Integers in place of paths or images are the numbers of frames in a video file.
+        # If the column has integers instead of paths or images, they are frame numbers of a video.
         if pa.types.is_integer(self._table.schema.field(self._column("data")).type):
             return "its images are in a film; py123d must store them as JPEG or PNG"
         return ""
@@ -95,7 +95,7 @@ class Camera:
 
         Args:
             row: Row of the image.
-            track: Poses of the IMU, from which the pose follows if the table has none.
+            track: Poses of the IMU, from which the pose is computed if the table has none.
 
         Raises:
             ValueError: If there is no pose.
@@ -111,7 +111,7 @@ class Camera:
     def image_path(self, row: int, root: Path, scene: str) -> str:
         """Path of an image below the data root.
 
-        The table has either the path or the image itself, which is then written to a file.
+        The table has either the path or the encoded image. An image is written to a file.
 
         Args:
             row: Row of the image.
@@ -142,7 +142,7 @@ class Camera:
     def calibration(self) -> dict[str, Any]:
         """Name, size, intrinsics and distortion of the camera.
 
-        The keys are the ones that `mapdata.custom.from_records` expects in a record of a camera.
+        They have the keys of a camera record of `mapdata.custom.from_records`.
 
         Raises:
             ValueError: If a value is missing.
@@ -239,7 +239,7 @@ class Log:
 
     @cached_property
     def cameras(self) -> list[Camera]:
-        """Usable cameras, by name."""
+        """Usable cameras, in the order of their names."""
         return [camera for camera in self._all_cameras if camera.name not in self.unused_cameras]
 
     @cached_property

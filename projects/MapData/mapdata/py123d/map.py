@@ -1,4 +1,4 @@
-"""Maps of py123d: elements around a pose."""
+"""Maps of py123d, and search for the elements near a point."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +20,7 @@ _LANE = 0
 _CROSSWALK = 3
 _ROAD_EDGE = 8
 _ROAD_LINE = 9
-_NO_PAINT = 0  # number of a kind of road line
+_NO_PAINT = 0  # kind of road lines that are not painted
 _LAYERS = {
     "divider": _ROAD_LINE,
     "ped_crossing": _CROSSWALK,
@@ -80,7 +80,7 @@ class Map:
             self.left_out += 1
             return
         if line.shape[1] == 2:
-            line = np.pad(line, ((0, 0), (0, 1)))  # height 0
+            line = np.pad(line, ((0, 0), (0, 1)))  # adds the height 0
         if len(line) < 2:
             self.left_out += 1
             return
@@ -88,7 +88,7 @@ class Map:
         self.labels.append(label)
 
     def around(self, point: np.ndarray, radius_m: float) -> list[dict[str, Any]]:
-        """Elements near a point in the plane, as `mapdata.custom.from_records` takes them.
+        """Find the elements near a point in the plane, as input of `mapdata.custom.from_records`.
 
         Args:
             point: Position in the global frame, in metres. (2,)

@@ -1,4 +1,4 @@
-"""Values in MessagePack, in which py123d stores metadata and features of maps."""
+"""Decoding of MessagePack, the format in which py123d stores metadata and map features."""
 
 import math
 from typing import Any
@@ -17,7 +17,7 @@ def unpack(content: bytes) -> Any:
     """Decode MessagePack, with arrays as py123d encodes them. No code of the content is run.
 
     Raises:
-        ValueError: If the content is damaged, or an array has another type than float.
+        ValueError: If the content is damaged, or an array is not float32 or float64.
     """
     msgpack = import_extra("msgpack", "py123d")
     return msgpack.unpackb(content, object_hook=_array_of)

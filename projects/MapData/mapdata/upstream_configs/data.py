@@ -1,4 +1,7 @@
-"""Conversion of data set, pipeline and schedule of an original config."""
+"""Conversion of the data set, pipeline and schedule of an upstream config to GSMap's settings.
+
+An upstream config belongs to the code that the authors of a model published.
+"""
 
 from typing import Any
 
@@ -23,7 +26,7 @@ FILE_SETTINGS = (
     "load_interval aux_seg fixed_ptsnum_per_line"
 )
 FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # z_cfg of points without heights
-# dotted names of settings in GSMap, by their dotted names in the original config
+# dotted names of settings in GSMap, by their dotted names in the upstream config
 SCHEDULE = {
     "lr_config.warmup_iters": "param_scheduler.0.end",
     "lr_config.warmup_ratio": "param_scheduler.0.start_factor",
@@ -40,7 +43,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
     """Convert the settings of the data and the image normalisation.
 
     Args:
-        fields: Settings of the config, from which the converted ones are removed.
+        fields: Settings of the config. Converted settings are removed from it.
 
     Returns:
         Settings by dotted name in GSMap, and further entries for the conversion of the model:
@@ -75,7 +78,8 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         },
         "with_depth": False,
     }
-    # `drop` removes the settings in `names`, and each keyword setting if it has the given value.
+    # `drop` removes the settings in `names`. It removes a setting that is given as a keyword only
+    # if it has the given value.
     fields.drop("data", names="shuffler_sampler nonshuffler_sampler")
     for part in ("train", "val", "test"):
         section = f"data.{part}"
@@ -119,7 +123,7 @@ def schedule_settings(fields: Fields) -> dict[str, Any]:
     """Convert the settings of optimizer, learning rate, epochs, checkpoints and log.
 
     Args:
-        fields: Settings of the config, from which the converted ones are removed.
+        fields: Settings of the config. Converted settings are removed from it.
 
     Returns:
         Settings by dotted name in GSMap.

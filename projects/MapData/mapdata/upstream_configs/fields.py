@@ -1,4 +1,4 @@
-"""Settings of an original config that are not converted yet."""
+"""Settings of a method's original config that are not converted to GSMap settings yet."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -11,8 +11,8 @@ _REQUIRED = object()
 class Fields:
     """Settings of a config by dotted name.
 
-    Settings that are taken or dropped are removed from ``values``, so the remaining ones have no
-    counterpart in GSMap. A number in a name is an index of a list.
+    Settings that are taken or dropped are removed from ``values``. The settings that remain after
+    the conversion have no counterpart in GSMap. A number in a name is an index of a list.
 
     Args:
         values: Settings of the config, nested dicts and lists. Modified in place.
@@ -96,8 +96,8 @@ class Fields:
         Args:
             section: Dotted name of the section of the settings.
             names: Names of settings to remove, separated by spaces.
-            fixed: Settings to remove if they have the given value, which is the only value that
-                GSMap supports.
+            fixed: Settings to remove if they have the given values, the only values that GSMap
+                supports.
         """
         values = self.section(section)
         for name in names.split():

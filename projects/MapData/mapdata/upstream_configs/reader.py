@@ -1,4 +1,4 @@
-"""Reader of config files of plain assignments that does not run them."""
+"""Reader of config files that consist of plain assignments. The files are not executed."""
 
 import ast
 import copy
@@ -144,7 +144,7 @@ def _compute(node: ast.expr, names: _Names) -> Any:
 
 
 def _mapping(pairs: Iterable[Any], names: _Names) -> dict[Any, Any]:
-    """Evaluate pairs of key and value nodes to a dict; ``**`` has the key None."""
+    """Evaluate pairs of key and value nodes to a dict. The key of a ``**`` expression is None."""
     values: dict[Any, Any] = {}
     for key_node, value_node in pairs:
         if key_node is None:

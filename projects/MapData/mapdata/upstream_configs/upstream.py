@@ -55,7 +55,7 @@ PILLAR_NAMES = {
     f"{_PILLARS}.feedforward_channels": _BEV + "layer_cfg.ffn_dims",
     f"{_PILLARS}.ffn_dropout": _BEV + "layer_cfg.dropout",
 }
-# supported types of parts of the model, by section
+# supported types of the parts of an original model, by section
 KINDS: dict[str, tuple[str, ...]] = {
     _ENCODER: ("BEVFormerEncoder", "LSSTransform"),
     _LAYER: ("DetrTransformerDecoderLayer", "DecoupledDetrTransformerDecoderLayer"),
@@ -75,7 +75,7 @@ FIXED_VALUES: dict[str, dict[str, Any]] = {
     f"{_SPATIAL}.attention": {"dilation": 1},
     **{section: {"z_cfg": FLAT} for section in (f"{_PTS_HEAD}.bbox_coder", _TRANSFORMER, _COSTS)},
 }  # fmt: skip
-# weights of parts that have no effect if the weight is zero, by section
+# names of the weights of parts that have no effect if their weight is zero, by section
 WEIGHTS = {
     f"{_PTS_HEAD}.loss_bbox": "loss_weight", f"{_PTS_HEAD}.loss_iou": "loss_weight",
     f"{_COSTS}.reg_cost": "weight", f"{_COSTS}.iou_cost": "weight",
@@ -112,7 +112,7 @@ class Conversion:
     Args:
         base: Path of the GSMap config to modify, relative to ``configs``.
         settings: Values by dotted name in GSMap.
-        steps: Settings of pipeline steps, by type of the step.
+        steps: Settings of the steps of the data pipelines, by type of the step.
         unplaced: Settings without a counterpart in GSMap, each as ``name = value``.
     """
 
@@ -463,7 +463,8 @@ def _rendered_mask_settings(fields: Fields, settings: dict[str, Any]) -> None:
     settings[_HEAD + "dice_cost"] = {"weight": dice_cost_weight}
     cost_weight = settings[_HEAD + "match_costs.1.weight"]
     if points_weight != cost_weight:
-        # GSMap has one weight for loss and cost, so a different cost weight counts as unplaced.
+        # GSMap has one weight for both loss and cost. A different cost weight is put back into the
+        # section, so that it is reported as unplaced.
         fields.section(f"{_COSTS}.pts_cost")["weight"] = cost_weight
 
 
@@ -477,7 +478,8 @@ def _margin_settings(fields: Fields, settings: dict[str, Any], sides: tuple[floa
         settings: Converted settings, to which the margin is added.
         sides: Smallest and largest x, then y, of the map in metres.
     """
-    # The limits are the smallest x and y of both corners of a prediction's box, then the largest.
+    # The box of a prediction has two corners. `limits` are the smallest x and y of the first and of
+    # the second corner, then the largest x and y of both.
     limits = fields.section(f"{_PTS_HEAD}.bbox_coder").get("post_center_range", ())
     if len(limits) != 8:
         return

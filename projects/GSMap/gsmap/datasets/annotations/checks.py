@@ -57,12 +57,13 @@ class _BatchChecker:
         Args:
             array: Array of a column or a field.
             name: Name of the column or field; with ``[]`` for items of a list.
-            rows: Index, in the batch, of the sample of each item. (items,)
+            rows: For each item, the index of its sample in the batch. (items,)
             where: Beginning of messages.
 
         Raises:
             ValueError: If a value is wrong or missing.
         """
+        # Only items of optional fields may be missing. The checks below skip missing items.
         if array.null_count:
             is_valid = array.is_valid().to_numpy(zero_copy_only=False)
             if name not in _OPTIONAL:
@@ -93,7 +94,7 @@ class _BatchChecker:
 
         Args:
             is_good: Result of the check of each item. (items,)
-            rows: Index, in the batch, of the sample of each item. (items,)
+            rows: For each item, the index of its sample in the batch. (items,)
             problem: Message about the first wrong item.
 
         Raises:
@@ -217,8 +218,8 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
         " of an element must be (n >= 2, {1.dim}), not NaN or infinite, nor beyond 100 km",
     ),
 }
-"""Test of the items of each field, and message about the first wrong item.
+"""By the name of a field, the test of its items and the message about the first wrong item.
 
-Tests get the array, the index of the sample of each item and the metadata. In messages, {0} is the
-item and {1} is the metadata.
+Arguments of a test are the array, the index of the sample of each item, and the metadata. In a
+message, {0} is the item and {1} is the metadata.
 """

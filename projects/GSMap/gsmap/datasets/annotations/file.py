@@ -1,7 +1,7 @@
 """Reader and writer of annotation files, memory-mapped Arrow files with the samples of a split.
 
-A command creates the file once; there is no hidden cache. The reader raises an error for a damaged
-file and for a file with other metadata than expected. Files have no pickled objects.
+A command creates the file once; there is no hidden cache. The reader raises an error if a file is
+damaged or has unexpected metadata. Files contain no pickled objects.
 """
 
 import json
@@ -178,7 +178,7 @@ def write_annotations(
 def merge_annotations(path: Path, shards: Sequence[ShardFile]) -> int:
     """Write an annotation file from the samples of all shards.
 
-    The file is equal, byte for byte, to a file that is written at once.
+    The file is equal, byte for byte, to a file that was written without shards.
 
     Args:
         path: File to write; parent folders are created.
@@ -188,7 +188,7 @@ def merge_annotations(path: Path, shards: Sequence[ShardFile]) -> int:
         Number of samples.
 
     Raises:
-        ValueError: If there is no sample, or two samples have one token.
+        ValueError: If there is no sample, or if two samples have the same token.
     """
     files = [AnnotationFile(shard.path) for shard in shards]
     if not any(map(len, files)):
@@ -215,10 +215,10 @@ def check_samples(samples: Sequence[MapSample], meta: AnnotationMeta) -> None:
 class AnnotationFile(Sequence[MapSample]):
     """Sequence of the samples in a memory-mapped annotation file.
 
-    The whole file is checked when it is opened. A pickled instance has only the path and the
-    checksums of the batches: each worker process maps the file, and all of them share its pages in
-    memory. In an unpickled instance, and after a change of the file, a batch is compared with its
-    checksum before it is read.
+    The whole file is checked when it is opened. A pickled instance contains only the path and the
+    checksums of the batches. Each worker process maps the file, and the processes share its pages
+    in memory. In an unpickled instance, and after a change of the file, each batch is compared with
+    its checksum before it is read.
 
     Args:
         path: Annotation file.
@@ -238,7 +238,10 @@ class AnnotationFile(Sequence[MapSample]):
         self._open()
 
     def _open(self, sums: list[tuple[int, int]] | None = None) -> None:
-        """Map and read the file, and check it unless ``sums`` of another process are given."""
+        """Map and read the file, and check it.
+
+        With ``sums``, the checksums of another process, each batch is checked when it is read.
+        """
         if not self.path.is_file():
             raise FileNotFoundError(
                 f"no annotation file at {self.path}: make it with tools/create_data.py (see "
@@ -303,8 +306,8 @@ class AnnotationFile(Sequence[MapSample]):
     def _current_state(self) -> tuple[int, int, int]:
         """Return size and time of the file, and the process id.
 
-        Size and time change when the file is written. The process id changes in a forked process,
-        which then checks the file again.
+        Size and time change when the file is written. In a forked process, the process id differs,
+        so this process checks the file again.
         """
         status = os.fstat(self._map.fileno())
         return status.st_size, status.st_mtime_ns, os.getpid()
@@ -389,13 +392,12 @@ class AnnotationFile(Sequence[MapSample]):
         names = np.array(self.column("scene"), dtype=str)
         _, scenes = np.unique(names, return_inverse=True)
         seconds = np.asarray(self.seconds_into_scene)
-        order = np.lexsort((seconds, scenes))
-        # Seconds between successive samples of one scene.
+        order = np.lexsort((seconds, scenes))  # by scene, then by time
         is_within_scene = np.diff(scenes[order]) == 0
-        steps = np.diff(seconds[order])[is_within_scene]
+        steps = np.diff(seconds[order])[is_within_scene]  # between successive samples of a scene
         if not len(steps):
             return
-        ratio = np.median(steps) * wanted_hz
+        ratio = np.median(steps) * wanted_hz  # wanted rate divided by the rate of the file
         if 0.8 < ratio < 1.25:
             return
         raise InputError(

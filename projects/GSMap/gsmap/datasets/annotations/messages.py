@@ -77,7 +77,7 @@ def checksums(content: pa.Buffer, ends: Sequence[int]) -> list[tuple[int, int]]:
         ends: Positions in bytes in ascending order; the first is 0.
 
     Returns:
-        Position and CRC-32 of all bytes before it, for each position.
+        Each position, with the CRC-32 of all bytes before it.
     """
     view = memoryview(content)
     checksum = 0

@@ -28,8 +28,8 @@ class CameraRecord:
         height: Height of the image in pixels.
         intrinsics: Pinhole matrix in pixels. (3, 3)
         cam_from_frame: Transform in metres from the annotation frame at the time of the sample to
-            the camera (z forward) at the time of the image, which includes the motion of the
-            vehicle in between. (4, 4)
+            the camera (z forward) at the time of the image. It includes the motion of the vehicle
+            between the two times. (4, 4)
     """
 
     name: str
@@ -106,9 +106,9 @@ class MapSample:
             (4, 4)
         lidar: LiDAR sweep, or None.
         can_bus: Vehicle signals in the layout of MapTR, or None. (18,)
-        instances: Map elements, which may be an empty list; None for unknown ground truth.
-        ego_from_frame: Transform in metres from the annotation frame to the vehicle. None if it is
-            not known; in the frame ``ego``, None is the identity. (4, 4)
+        instances: Map elements. The list may be empty; None means that ground truth is unknown.
+        ego_from_frame: Transform in metres from the annotation frame to the vehicle. None means the
+            identity in the annotation frame ``ego``, and unknown in other frames. (4, 4)
     """
 
     token: str
@@ -124,7 +124,7 @@ class MapSample:
 
 
 def _check_classes(classes: Any) -> tuple[str, ...]:
-    """Return the names of classes, after a check that they are different texts."""
+    """Check that the names of classes are different, non-empty texts, and return them."""
     names = classes if isinstance(classes, (list, tuple)) else ()
     are_texts = all(isinstance(name, str) and name for name in names)
     if not names or not are_texts or len(set(names)) < len(names):
@@ -148,7 +148,7 @@ class AnnotationMeta:
             the frame.
         y_range: Smallest and largest y of the ground truth in metres; None for the usual range of
             the frame.
-        dim: Coordinates per point, 2 or 3.
+        dim: Number of coordinates per point, 2 or 3.
         source_fingerprint: Digest of the source data; empty if unknown.
         versions: Versions of the libraries that were used for the conversion.
         options: Options of the conversion that change the content.

@@ -1,7 +1,7 @@
 """Columns of an annotation file, and conversion of samples to and from rows.
 
-Columns have the names of the fields of the records. Conversions in both directions follow the
-nested types of the columns.
+Each column has the name of a field of `MapSample`. Nested records are nested columns, and both
+conversions follow these nested types.
 """
 
 import json
@@ -34,7 +34,7 @@ _SHAPES = {
     "cam_from_frame": (4, 4),
     "frame_from_lidar": (4, 4),
 }
-_INTEGERS = {"timestamp_ns", "width", "height", "label"}
+_INTEGERS = {"timestamp_ns", "width", "height", "label"}  # fields that are converted to int
 _CAMERA = pa.struct(
     {
         "name": pa.string(),
@@ -73,7 +73,7 @@ _RECORDS: dict[pa.DataType, Any] = {
 def schema_of(meta: AnnotationMeta) -> pa.Schema:
     """Return the schema of a file with its metadata."""
     values = asdict(meta)
-    if meta.ground_z_m is None:  # earlier versions do not know the field
+    if meta.ground_z_m is None:  # left out for earlier versions, which lack this field
         del values["ground_z_m"]
     return pa.schema(FIELDS, metadata={META_KEY: json.dumps(values).encode()})
 
@@ -84,7 +84,7 @@ def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]
     Args:
         record: Sample or record.
         meta: Metadata of the file.
-        where: Beginning of messages about errors.
+        where: Beginning of error messages.
 
     Returns:
         Values by the name of the column.

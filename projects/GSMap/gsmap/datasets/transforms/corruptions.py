@@ -1,7 +1,7 @@
 """Corruptions of camera images and calibrations: failures, shifts, delays, weather and compression.
 
 The kinds of corruptions and their five severities follow MapBench and ImageNet-C. Random numbers
-depend only on the seed and the token of the sample, so all severities of a kind use the same ones.
+depend only on the seed and the token of the sample, so they are equal for all severities of a kind.
 """
 
 from collections.abc import Callable
@@ -29,8 +29,8 @@ SEVERITIES = (1, 2, 3, 4, 5)
 Image = NDArray[np.uint8]
 
 # Each tuple has one value for each of the five severities.
-_TURNS_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)
-_SHIFTS_M = (0.02, 0.05, 0.1, 0.2, 0.4)
+_TURNS_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)  # rotations of the extrinsics
+_SHIFTS_M = (0.02, 0.05, 0.1, 0.2, 0.4)  # translations of the extrinsics
 _VISIBILITY_M = (200.0, 100.0, 60.0, 40.0, 25.0)  # limit of visibility in fog
 # Number of streaks of rain per pixel. Each streak covers many pixels.
 _RAIN_DENSITIES = (0.001, 0.002, 0.0035, 0.0055, 0.008)
@@ -55,7 +55,7 @@ def generator(seed: int, token: str) -> np.random.Generator:
 
 
 def lose_cameras(results: dict[str, Any], views: NDArray[np.integer[Any]]) -> None:
-    """Black out views and direct them away from the map, like missing cameras at inference.
+    """Black out views and turn them away from the map, like missing cameras at inference.
 
     Args:
         results: Results of the pipeline; the lists ``img``, ``lidar2cam`` and ``lidar2img`` are
@@ -78,15 +78,15 @@ def _set_extrinsics(results: dict[str, Any], view: int, lidar2cam: NDArray[np.fl
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class CorruptImages(BaseTransform):
-    """Corrupt the images or the calibration of all cameras.
+    """Transform that corrupts the images or the calibration of all cameras.
 
     The transform must come after ``LoadCameraImages``.
 
     Args:
         kind: Kind of corruption, one of ``KINDS``. ``camera_lost`` blacks out as many cameras as
-            the severity, but at least one remains. ``rotation`` and ``translation`` change the
-            calibration but not the image of each camera, by 0.25 to 4 degrees about a random axis
-            or by 2 to 40 cm in a random direction.
+            the severity, but at least one remains. ``rotation`` and ``translation`` change only the
+            calibration of each camera: by 0.25 to 4 degrees about a random axis, or by 2 to 40 cm
+            in a random direction.
         severity: Severity from 1 to 5.
         seed: Seed of the random numbers.
 
@@ -143,8 +143,8 @@ def fog(results: dict[str, Any], view: int, visibility_m: float) -> NDArray[Any]
     """Add fog to a view.
 
     The contrast decreases exponentially with the distance and is 5 % at the limit of visibility
-    (Koschmieder's law). The distance of a pixel is the distance of level ground there, at most
-    60 m.
+    (Koschmieder's law). The distance of a pixel is the distance at which its ray meets level
+    ground, at most 60 m.
 
     Args:
         results: Results of the pipeline, with images and calibration.
@@ -178,13 +178,14 @@ def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
         rng: Generator for the places of the streaks.
     """
     height, width = image.shape[:2]
-    is_centre = rng.random((height, width)) < _RAIN_DENSITIES[level]
-    centres = is_centre.astype(np.float32)  # of the streaks
+    is_centre = rng.random((height, width)) < _RAIN_DENSITIES[level]  # of a streak
+    centres = is_centre.astype(np.float32)
     length = max(3, round(0.06 * height))
     streak = np.zeros((length, length), dtype=np.float32)
     top = (length * 2 // 5, 0)  # (column, row)
     bottom = (length * 3 // 5, length - 1)  # the streak is nearly vertical
     cv2.line(streak, top, bottom, color=(1.0,))
+    # The filter draws a streak around each centre.
     streaks = cv2.filter2D(centres, ddepth=-1, kernel=streak)
     opacity = np.clip(streaks, 0, 1)[..., None] * _STREAK_OPACITY
     greyness = 0.04 * (level + 1)
@@ -255,7 +256,7 @@ KINDS = ("camera_lost", *_CALIBRATION_ERRORS, "fog", *_IMAGE_CORRUPTIONS)
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class DelayCameras(BaseTransform):
-    """Replace the images of some cameras by the images of the previous sample of the scene.
+    """Transform that replaces images of some cameras by images of the scene's previous sample.
 
     The first sample of a scene does not change. The transform must come before
     ``LoadCameraImages``.
@@ -318,7 +319,7 @@ class DropCameras(BaseTransform):
     The transform must come after all image steps.
 
     Args:
-        prob: Share of the samples with missing cameras, from 0 to 1.
+        prob: Probability that cameras of a sample are missing, from 0 to 1.
         max_num: Largest number of missing cameras. All numbers from 1 are equally probable. At
             least one camera remains.
     """

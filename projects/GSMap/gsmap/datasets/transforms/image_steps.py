@@ -31,7 +31,7 @@ class ImageStep(Protocol):
         """Transform images with torch. (V, 3, H, W) -> (V, 3, H', W')"""
 
     def join(self, others: "Sequence[Any]") -> "ImageStep | None":
-        """Join with the steps of the other samples of a batch to one step for all of their images.
+        """Join this step and the steps of the other samples of a batch to one step for all images.
 
         Returns:
             The joint step, or None if the steps cannot be joined.
@@ -164,9 +164,10 @@ class Distortion:
     """Image step of a photometric distortion with separate parameters for each image.
 
     Args:
-        numbers: Parameters of each image, drawn by ``PhotoMetricDistortion3D``: 1 if the contrast
-            changes before the colours, five flags for the parameters that are used, brightness,
-            contrast, saturation, hue and order of the channels.
+        numbers: Parameters of each image, drawn by ``PhotoMetricDistortion3D``. The first is 1 if
+            the contrast changes before the colours. Then follow five flags, which select the
+            parameters in use, and these parameters: brightness, contrast, saturation, hue and order
+            of the channels.
     """
 
     numbers: tuple[tuple[Any, ...], ...]
@@ -199,7 +200,7 @@ class Distortion:
 
 
 def _distortion_row(numbers: tuple[Any, ...]) -> list[float]:
-    """Return the parameters of `distort_images`, which are neutral for flags that are not set."""
+    """Parameters of one image for `distort_images`; neutral values where a flag is not set. (8,)"""
     mode, has_brightness, has_contrast, has_saturation, has_hue, has_order = numbers[:6]
     brightness, contrast, saturation, hue, order = numbers[6:]
     contrast_first = mode == 1  # otherwise the contrast changes after the colours
@@ -241,7 +242,7 @@ def distort_images(images: Tensor, numbers: Tensor) -> Tensor:
     angle = torch.where(value == red, hue_near_red, hue_not_near_red)
     angle = torch.where(angle < 0, angle + 360.0, angle) + hue  # degrees
     # Back to BGR:
-    # A channel is value - chroma * max(0, min(turn, 4 - turn, 1)) with
+    # Each channel is value - chroma * max(0, min(turn, 4 - turn, 1)) with
     # turn = (angle / 60 + sector) mod 6, where the sector is 1 for blue, 3 for green and 5 for red.
     chroma = value * new_saturation
     channels = []

@@ -40,8 +40,8 @@ class LoadCameraImages(BaseTransform):
 
     Args:
         to_float32: Whether to convert the images to float32 directly after loading.
-        on_device: Whether to record later image steps for the GPU (`image_steps`) and to leave the
-            images in uint8.
+        on_device: Whether to leave the images in uint8 and to record the later image steps
+            (`image_steps`), which the GPU then carries out.
     """
 
     to_float32: bool = True
@@ -107,7 +107,7 @@ class ScaleImages(BaseTransform):
         kernel: ``bilinear`` or ``bicubic``, see `Resize`.
 
     Raises:
-        ValueError: If both or none of ``scale`` and ``size`` are given, the given one is not
+        ValueError: If both or neither of ``scale`` and ``size`` are given, the given one is not
             positive, or the kernel is unknown.
     """
 

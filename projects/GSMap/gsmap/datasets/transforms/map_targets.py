@@ -43,21 +43,21 @@ def map_targets(
         x_range: Smallest and largest x in metres. Points outside are moved to the edge.
         y_range: Smallest and largest y in metres. Points outside are moved to the edge.
         dim: Coordinates per point, 2 or 3. Heights are interpolated but not clamped.
-        rng: Generator that selects P - 1 orders of a ring with more than P - 1 vertices; None for
-            an even selection.
-        orders_of: Starts of the orders of a ring. ``vertices``: one order starts at each vertex and
-            keeps the direction of the ring (MapTR). ``points``: two orders, forward and reversed,
-            start at each of the P - 1 different resampled points, and a line whose ends almost meet
-            is treated as a ring.
+        rng: Generator that selects P - 1 orders at random if a ring has more than P - 1 vertices;
+            None for an even selection.
+        orders_of: Points at which the equivalent orders of a ring start. ``vertices``: one order
+            starts at each vertex, in the direction of the ring (MapTR). ``points``: two orders,
+            forward and reversed, start at each of the P - 1 different resampled points. A line
+            whose ends almost meet then counts as a ring.
 
     Returns:
-        Targets of the elements: ``labels_3d`` (K,), int64; ``pts`` (K, P, dim), the resampled
-        points; ``pts_shifts`` (K, S, P, dim), the points in S equivalent orders, with S =
-        max(P - 1, 2) for ``vertices`` and 2 (P - 1) for ``points``, where unused orders are
-        -10000; ``boxes`` (K, 4), as (x_min, y_min, x_max, y_max); ``polylines``
-        (K, M, 2), the elements at full resolution, where the last vertex is repeated up to the
-        length of the longest element; ``closed`` (K,), bool, whether an element is a ring.
-        Coordinates are float32 in metres.
+        Targets of the elements, with coordinates in metres as float32. ``labels_3d`` (K,) are the
+        class indices, int64. ``pts`` (K, P, dim) are the resampled points. ``pts_shifts``
+        (K, S, P, dim) are the points in S equivalent orders, with S = max(P - 1, 2) for
+        ``vertices`` and S = 2 (P - 1) for ``points``; unused orders are filled with -10000.
+        ``boxes`` (K, 4) are (x_min, y_min, x_max, y_max). ``polylines`` (K, M, 2) are the elements
+        at full resolution; shorter ones repeat their last vertex up to the M vertices of the
+        longest element. ``closed`` (K,), bool, is True for rings.
 
     Raises:
         ValueError: If elements have fewer coordinates than ``dim``, or ``orders_of`` is unknown.
@@ -114,8 +114,8 @@ def ends_meet(
 ) -> bool:
     """Test whether the ends of a line almost meet.
 
-    Along x and along y, the distance of the ends must be at most about a thousandth of the map's
-    extent.
+    They do if their distance along each axis, x and y, is at most about a thousandth of the map's
+    extent along this axis.
 
     Args:
         points: Points of the line in metres. (P, D)
@@ -134,8 +134,8 @@ def ends_meet(
 class FormatMapTargets(BaseTransform):
     """Add the training targets of `map_targets` as ``gt_instances_3d``.
 
-    Points have ``dim`` coordinates, as set in the data set. The orders of rings with more than
-    P - 1 vertices are drawn at random in each epoch, as in MapTR.
+    The data set determines the number of coordinates per point (``dim``). The orders of rings with
+    more than P - 1 vertices are drawn at random each time, as in MapTR.
 
     Args:
         num_points: Number P of points per element.

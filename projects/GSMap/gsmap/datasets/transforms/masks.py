@@ -135,6 +135,7 @@ class MakeInstanceMasks(BaseTransform):
             _draw_line(gaps[index], cells, thickness_px=self.gap_px)
         labels = np.array([instance.label for instance in instances])
         for index, label in enumerate(labels):
+            # The masks of later elements are still complete here.
             later_masks = masks[index + 1 :]
             later_labels = labels[index + 1 :]
             later_of_class = later_masks[later_labels == label]

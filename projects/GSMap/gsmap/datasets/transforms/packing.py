@@ -1,4 +1,4 @@
-"""Packing of the results of the pipeline for the model."""
+"""Transform that packs the results of the data pipeline into the inputs of the model."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -28,8 +28,8 @@ _MATRIX_KEYS = ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix")
 class PackMapInputs(BaseTransform):
     """Pack images, points, targets and metainfo for the model (see ``docs/architecture.md``).
 
-    All targets among ``TARGET_KEYS`` that earlier transforms have added are packed. Lists of
-    matrices become arrays. (V, 4, 4)
+    All targets among ``TARGET_KEYS`` that earlier transforms have added are packed. Lists of V
+    matrices become arrays (V, 4, 4).
 
     Args:
         with_points: Whether the model receives the loaded points. Set it to False if the points are
@@ -86,6 +86,6 @@ class PackMapInputs(BaseTransform):
 
 def _is_finite(image: NDArray[np.floating[Any]]) -> bool:
     """Test whether all values of an image are finite."""
-    # The sum is fast to compute. If it is finite, so are all values. An infinite sum may also be an
-    # overflow, so then each value is tested.
+    # The sum is fast to compute. If it is finite, so are all values. If it is not, the sum may have
+    # overflowed, so each value is tested.
     return bool(np.isfinite(image.sum()) or np.isfinite(image).all())

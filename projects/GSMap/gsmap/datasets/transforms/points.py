@@ -32,9 +32,9 @@ def read_points(path: str, load_dim: int) -> np.ndarray:
             order of ``FEATHER_COLUMNS``.
 
     Returns:
-        Points with x, y, z in metres in the frame of the file, intensity from 0 to 255, number of
-        the laser, and for a ``.feather`` file the time since the start of the sweep in nanoseconds,
-        float32. (n, load_dim)
+        Points, float32. The values of a point are x, y, z in metres in the frame of the file,
+        intensity from 0 to 255 and number of the laser. A ``.feather`` file also has the time since
+        the start of the sweep in nanoseconds. (n, load_dim)
 
     Raises:
         BrokenSampleError: If the file is missing or truncated, or has other content.
@@ -163,7 +163,7 @@ class PointsToFrame(BaseTransform):
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class MakeDepthMap(BaseTransform):
-    """Add ``gt_depth``, the depth of the nearest point at each pixel in metres. (V, H, W)
+    """Add ``gt_depth``, the depth in metres of the nearest LiDAR point at each pixel. (V, H, W)
 
     Pixels without a point are 0. The transform must follow all transforms that load points or
     resize images.
@@ -184,8 +184,8 @@ class MakeDepthMap(BaseTransform):
         min_depth, max_depth = self.depth_range
         depths = np.zeros((len(results["lidar2img"]), height, width), dtype=np.float32)
         for view, lidar2img in enumerate(results["lidar2img"]):
-            projected = homogeneous @ lidar2img.T  # (n, 4)
-            u, v, depth = projected[:, :3].T
+            projected = homogeneous @ lidar2img.T  # (u * depth, v * depth, depth, 1). (n, 4)
+            u, v, depth = projected[:, :3].T  # u and v are divided by the depth below
             in_range = (depth >= min_depth) & (depth < max_depth)
             depth = depth[in_range]
             col = np.round(u[in_range] / depth)

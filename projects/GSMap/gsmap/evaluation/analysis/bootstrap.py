@@ -1,8 +1,8 @@
 """Confidence intervals of AP by the bootstrap over scenes.
 
-A resample draws as many scenes with replacement as the data set has. A scene that is drawn k times
-counts as k copies of its samples; the copies of a prediction have consecutive ranks. Matches do not
-depend on the resample and are computed once.
+A resample draws scenes with replacement, as many as the data set has. A scene that is drawn k times
+counts as k copies of its samples. In the ranking by score, the copies of a prediction follow each
+other. Matches do not depend on the resample and are computed once.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,12 +19,12 @@ from gsmap.utils.errors import InputError
 
 _RECALL_POINTS = np.linspace(0.0, 1.0, num=101)
 _SPACING = np.spacing(1.0)  # COCO adds it to the denominator of the precision
-_PERCENTILES = (2.5, 97.5)  # ends of the interval of 95 %
+_PERCENTILES = (2.5, 97.5)  # ends of the 95 % interval
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Interval of 95 % of a figure (the value of a metric), or of the difference of two figures.
+    """95 % confidence interval of a figure (value of a metric), or of a difference of two figures.
 
     Args:
         value: Figure or difference over all scenes.
@@ -38,13 +38,13 @@ class Interval:
 
 
 class Weights(Protocol):
-    """Interface of resamples: each of B resamples has copies of parts of the data set.
+    """Interface of B resamples, each of which counts every part of the data set a number of times.
 
-    The parts are, for example, its scenes.
+    The parts are, for example, the scenes.
     """
 
     def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
-        """Draw the numbers of copies.
+        """Draw the number of copies of each part in each resample.
 
         Args:
             tokens: Tokens of the samples. (S,)
@@ -108,17 +108,18 @@ class Resamples:
 def _weighted_ap(
     hit_rows: IntArray, copies: FloatArray, ranks: FloatArray, total: float, interpolated: bool
 ) -> float:
-    """Compute the AP of predictions with copies.
+    """Compute the AP of predictions, each of which counts as a number of copies.
 
-    The loop over hits starts at the lowest score. The precision envelope at a hit, the largest
-    precision at its recall or above, is then the largest precision of the hits so far.
+    The precision envelope at a hit is the largest precision at its recall or a higher one. The loop
+    goes from the hit with the lowest score to the one with the highest, so the envelope is the
+    largest precision of the hits so far.
 
     Args:
         hit_rows: Indices of the predictions that match, in descending order of score. (H,)
         copies: Number of copies of each prediction. (N,)
-        ranks: Number of copies of each prediction and of all predictions with a higher score. (N,)
+        ranks: Number of copies of each prediction plus all copies of predictions before it. (N,)
         total: Number of ground truths, each counted as often as it has copies, > 0.
-        interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
+        interpolated: Whether AP is the mean precision at 101 recalls, instead of the area.
     """
     true_positives = 0.0
     for i in hit_rows:
@@ -136,7 +137,7 @@ def _weighted_ap(
         envelope = max(envelope, true_positives / denominator)
         true_positives -= copies[i]  # now the number before this hit
         if interpolated:
-            # This hit raises the recall above these recall points: they have its envelope.
+            # Recall points that are reached with this hit, but not without it, have its envelope.
             while _RECALL_POINTS[point] > true_positives / total:
                 ap += envelope
                 point -= 1
@@ -159,12 +160,13 @@ def _aps(
     """Compute the AP of each resample at each threshold from the indices of the hits.
 
     Args:
-        hit_rows: Indices of the predictions that match, for one threshold after the other. (H,)
-        ends: End of each threshold in ``hit_rows``. (T,)
+        hit_rows: Indices of the predictions that match at the first threshold, followed by the
+            other thresholds. (H,)
+        ends: End (exclusive) of each threshold in ``hit_rows``. (T,)
         scene: Scene of each prediction. (N,)
         scene_copies: Number of copies of each scene. (B, scenes)
         gts: Number of ground truths of each scene. (scenes,)
-        interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
+        interpolated: Whether AP is the mean precision at 101 recalls, instead of the area.
 
     Returns:
         AP; NaN without ground truths. (B, T)
@@ -201,7 +203,7 @@ def resampled_aps(
         scene: Scene of each prediction. (N,)
         scene_copies: Number of copies of each scene. (B, scenes)
         gts: Number of ground truths of each scene. (scenes,)
-        interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
+        interpolated: Whether AP is the mean precision at 101 recalls, instead of the area.
 
     Returns:
         AP; NaN without ground truths. (B, T)
@@ -226,13 +228,14 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
         resamples: The B resamples.
 
     Returns:
-        AP by its flat key, NaN where it does not exist (B,); empty for a metric that ranks no
-        predictions.
+        AP in each resample (B,) by its flat key, such as ``<metric>/<class>/AP@<threshold>``; NaN
+        if it is not defined. Empty for a metric that ranks no predictions.
     """
     if not report.detections:
         return {}
     scenes, scene_copies = resamples.draw_copies(report.tokens)
-    interpolated = not report.by_distance  # AP_chamfer is an area, AP_raster a mean at 101 recalls
+    # AP_chamfer, whose matches are by distance, is an area. AP_raster is a mean at 101 recalls.
+    interpolated = not report.by_distance
     class_aps: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}
     for name, ranked in report.detections.items():
@@ -251,7 +254,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
             )
         class_aps[name] = aps
         if report.by_distance and not report.sample_aps:
-            # AP_chamfer of an absent class is 0, but does not count in the mean over the classes.
+            # AP_chamfer of an absent class is 0, but the mean over the classes leaves it out.
             aps = np.nan_to_num(aps)
         for t, threshold in enumerate(ranked.thresholds):
             figures[f"{name}/AP@{threshold}"] = aps[:, t]
@@ -272,7 +275,7 @@ def _mean_of_samples(aps: FloatArray, scenes: IntArray, scene_copies: FloatArray
     """Compute the mean AP over the samples of each resample.
 
     Args:
-        aps: AP of each sample, NaN where it does not count. (S, T)
+        aps: AP of each sample; NaN for samples that do not count. (S, T)
         scenes: Scene of each sample. (S,)
         scene_copies: Number of copies of each scene. (B, scenes)
 
@@ -301,7 +304,7 @@ def _mean(values: Sequence[FloatArray]) -> FloatArray:
 
 
 def _interval(value: float, values: FloatArray) -> Interval:
-    """Create the interval of a figure from its values in the resamples; NaN values are left out."""
+    """Create the interval of a figure from its values in the resamples, without NaN values."""
     known = values[~np.isnan(values)]
     if not len(known):
         return Interval(value, low=UNDEFINED, high=UNDEFINED)
@@ -310,14 +313,14 @@ def _interval(value: float, values: FloatArray) -> Interval:
 
 
 def ap_intervals(reports: Sequence[MetricReport], resamples: Resamples) -> dict[str, Interval]:
-    """Compute the interval of 95 % of every AP.
+    """Compute the 95 % confidence interval of every AP.
 
     Args:
         reports: Reports of all metrics over all samples.
         resamples: Resamples of the scenes.
 
     Returns:
-        Intervals by flat key.
+        Intervals by flat key, see `resampled_figures`.
     """
     intervals = {}
     for report in reports:
@@ -329,9 +332,9 @@ def ap_intervals(reports: Sequence[MetricReport], resamples: Resamples) -> dict[
 def ap_differences(
     first: Sequence[MetricReport], second: Sequence[MetricReport], resamples: Resamples
 ) -> dict[str, Interval]:
-    """Compute the interval of 95 % of the difference of every AP, first minus second.
+    """Compute the 95 % confidence interval of the difference of every AP, first minus second.
 
-    A resample draws equal scenes for both results, so that the difficulty of the scenes cancels.
+    Each resample has equal scenes in both results, so the difficulty of the scenes cancels.
 
     Args:
         first: Reports of all metrics of the first result.
@@ -339,7 +342,7 @@ def ap_differences(
         resamples: Resamples of the scenes.
 
     Returns:
-        Intervals by flat key, of the figures that both results have.
+        Intervals by flat key, for the AP that is defined in both results.
 
     Raises:
         ValueError: If metrics or samples of the results differ.
@@ -365,7 +368,7 @@ def _samples_of_metrics(reports: Sequence[MetricReport]) -> list[tuple[str, list
 
 
 def format_intervals(intervals: Mapping[str, Interval], title: str, signed: bool = False) -> str:
-    """Format a table with a row per figure and its interval.
+    """Format a table with one row for each figure: its key, value and interval.
 
     Args:
         intervals: Intervals by key.

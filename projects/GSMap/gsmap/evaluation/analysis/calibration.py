@@ -1,6 +1,7 @@
-"""Calibration of Gaussians: their sigmas against the errors of vertices that AP_chamfer matches.
+"""Calibration of Gaussians: whether their sigmas agree with the errors of the vertices.
 
-Errors and sigmas are along and across the line (`gsmap.structures.gaussians.line_errors`).
+The vertices are from predictions that AP_chamfer matches. Errors and sigmas are measured along and
+across the line (`gsmap.structures.gaussians.line_errors`).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,16 +20,16 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import LAW_NAMES
 
 AXES = ("along", "across")
-# Limits of the bands of distance. The first band begins at the vehicle, the last one has no end.
+# Limits of the bands of distance from the vehicle: 0 to 10 m, 10 to 20 m, and beyond 20 m.
 DISTANCES_M = (0.0, 10.0, 20.0, np.inf)
 LEVELS = np.linspace(0.05, 0.95, num=19)  # probabilities of central intervals
-_STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))
+_STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))  # both have variance 1
 LAWS = dict(zip(LAW_NAMES, _STANDARD, strict=True))
 """Laws of errors (probability distributions) of variance 1, by name."""
 # Probabilities that an error of a normal law lies within one and within two sigma.
 COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()
 _FEWEST = 100  # smallest number of vertices of a class for which factors of the class are fitted
-_COLUMNS = (  # keys of figures and titles of the columns of the table
+_COLUMNS = (  # for each column of the table, the key of its figure and its title
     ("nll", "NLL"), ("coverage@1", "68.3 %"), ("coverage@2", "95.4 %"), ("sigma_m", "sigma m"),
     ("error_m", "error m"), ("reliability_error", "reliab."), ("sparsification_error", "spars."),
     ("rank_correlation", "rank"), ("distance_rank_correlation", "by dist."),
@@ -65,7 +66,7 @@ def matched_vertices(samples: Iterable[Sample], config: ChamferConfig) -> Vertic
 
     Args:
         samples: Samples whose predictions have Gaussians.
-        config: Rules of the match.
+        config: Settings of the matching.
 
     Raises:
         ValueError: If predictions of a sample have no Gaussians, or no prediction matches.
@@ -106,8 +107,9 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
         span = slice(predictions.offsets[row], predictions.offsets[row + 1])
         points = predictions.points[span, :2]
         line = gt_lines[gt][:, :2]
-        # The line is resampled to as many points as the prediction has, in each direction and, if
-        # it is closed, from each start. The order nearest to the prediction pairs their points.
+        # `orders` are the points of the true line in all equivalent orders: in both directions and,
+        # if the line is closed, from each start. The points of the nearest order are paired with
+        # the points of the prediction.
         orders = equivalent_orders(line, num_points=len(points))
         nearest_order = np.abs(orders - points).sum(axis=(1, 2)).argmin()
         means = torch.tensor(points)
@@ -116,7 +118,7 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
             scales=torch.tensor(predictions.scales[span]),
             rotations=torch.tensor(predictions.rotations[span]),
         )
-        # The error along the line is measured to the paired point, the error across to the line.
+        # The error along the line is relative to the paired point, the error across to the line.
         target = torch.tensor(orders[nearest_order])
         yield Vertices(
             labels=np.full(len(points), fill_value=predictions.labels[row]),
@@ -127,7 +129,7 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
 
 
 def half_widths(law: str, levels: Sequence[float] | FloatArray) -> FloatArray:
-    """Compute half the widths of the central intervals of a law, in sigma.
+    """Compute half the widths of the central intervals of a law, in units of sigma.
 
     Args:
         law: ``normal``, or ``laplace`` with equal variance and longer tails.
@@ -155,11 +157,11 @@ def reliability(errors: FloatArray, sigmas: FloatArray, law: str = "normal") -> 
 
 
 def sparsification(errors: FloatArray, order: FloatArray) -> FloatArray:
-    """Compute the sparsification curve: the mean error of the k first values, for each k.
+    """Compute the sparsification curve: the mean of the first k errors, for each k.
 
     Args:
         errors: Errors in metres, >= 0. (n,)
-        order: Values by which errors are sorted, ascending. (n,)
+        order: Sort keys of the errors, which are sorted in ascending order of the keys. (n,)
 
     Returns:
         Mean errors in metres, for k from 1 to n. (n,)
@@ -169,7 +171,7 @@ def sparsification(errors: FloatArray, order: FloatArray) -> FloatArray:
 
 
 def rank_correlation(first: FloatArray, second: FloatArray) -> float:
-    """Compute Spearman's rank correlation; 0 if one side is constant.
+    """Compute Spearman's rank correlation; 0 if one argument is constant or has a single value.
 
     Args:
         first: Values. (n,)
@@ -181,7 +183,7 @@ def rank_correlation(first: FloatArray, second: FloatArray) -> float:
 
 
 def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, float]:
-    """Compute the scores of one or more vertices.
+    """Compute the calibration figures of vertices.
 
     The figures of each direction are:
 
@@ -232,7 +234,9 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
 def uncertainty_report(
     vertices: Vertices, classes: Sequence[str], areas: Sequence[str], law: str = "normal"
 ) -> MetricReport:
-    """Compute the scores of each class and of all lines, overall and by distance from the vehicle.
+    """Compute the calibration figures of each class and of all lines, in total and by distance.
+
+    The distance of a vertex is measured from the vehicle.
 
     Args:
         vertices: Matched vertices.
@@ -265,7 +269,7 @@ def uncertainty_report(
 
 
 def format_uncertainty(metrics: Mapping[str, float], law: str = "normal") -> str:
-    """Format the table of an ``uncertainty_report``: a row per class, band of distance and axis.
+    """Format the table of an `uncertainty_report`, with a row per class, distance band and axis.
 
     Args:
         metrics: Figures of the report.
@@ -298,18 +302,18 @@ def format_uncertainty(metrics: Mapping[str, float], law: str = "normal") -> str
 def fit_factors(
     vertices: Vertices, classes: Sequence[str], num_sigmas: float = 1.0, law: str = "normal"
 ) -> FloatArray:
-    """Fit factors of the sigmas of each class, so that a central interval has its coverage.
+    """Fit a factor for the sigmas of each class, so that an interval covers its share of errors.
 
     Args:
         vertices: Matched vertices.
         classes: Names of the classes.
-        num_sigmas: Number n in (0, 3] that sets the coverage of the interval: the probability of a
-            normal error to lie within n sigma, which is 68.3 % for n = 1 and 95.4 % for n = 2. If
-            the tails of the errors differ from the law, the factors fit this interval only.
+        num_sigmas: Number n in (0, 3] that sets the share: the probability that a normal error lies
+            within n sigma, which is 68.3 % for n = 1 and 95.4 % for n = 2. If the distribution of
+            the errors differs from the law, other intervals do not cover their shares.
         law: Law of the errors, one of ``LAWS``.
 
     Returns:
-        Factors of the sigmas along and across the line. (C, 2)
+        Factors of the sigmas along and across the line. (classes, 2)
 
     Raises:
         ValueError: If a class has too few vertices, or ``num_sigmas`` is not in (0, 3].

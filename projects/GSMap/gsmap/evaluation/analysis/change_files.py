@@ -19,7 +19,7 @@ STEP_M = 0.5
 _FARTHEST_M = 1e7  # largest coordinate
 _LONGEST_M = 1e6  # largest sum of the lengths of all changes of a file
 _LONGEST_NAME = 80  # letters
-_ABSENT = "absent"  # stands for the value of a key that the file does not contain
+_ABSENT = "absent"  # value of a key that the file does not contain
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +30,9 @@ class MapChange:
         kind: One of `KINDS`.
         class_name: Class of the element.
         map_name: Name of the map, in whose global frame the points are; empty if unknown.
-        points: Vertices in metres, closed for areas. A removed element is in its old place, an
-            added or moved one in its new place. (n, 2)
-        old_points: Vertices of a moved element in its old place, or None if unknown. (m, 2)
+        points: Vertices in metres, closed for areas: the old place of a removed element, or the new
+            place of an added or moved element. (n, 2)
+        old_points: Vertices of the old place of a moved element, or None if unknown. (m, 2)
         confidence: Confidence in [0, 1].
         moved_m: Distance in metres by which an element has moved, or None if unknown.
         moved_std_m: Standard error of this distance in metres, or None if unknown.
@@ -56,12 +56,12 @@ class MapChange:
 
 
 def read_changes(path: str | Path) -> list[MapChange]:
-    """Read the changes of ``build_map --changes`` or of MiniCity.
+    """Read a file of changes, written by ``build_map --changes`` or by MiniCity.
 
     A feature is a line, or a polygon whose outer ring is used. Its properties are ``change`` (one
-    of `KINDS`) and ``class``. If they are known, it also has ``map``, ``confidence``, the ``old``
-    vertices, ``moved_m`` and ``moved_std_m``. The numbers of drives of `MapChange.passes` are
-    ``passes_not_seen`` (of a removed element) or ``passes_seen``, and ``passes_in_view``.
+    of `KINDS`) and ``class``. Optional properties are ``map``, ``confidence``, ``old`` (vertices of
+    the old place), ``moved_m`` and ``moved_std_m``. `MapChange.passes` is read from the optional
+    properties ``passes_seen`` (``passes_not_seen`` for a removed element) and ``passes_in_view``.
 
     Args:
         path: File, which may be untrusted. Coordinates are metres of the global frame
@@ -112,7 +112,7 @@ def _read_feature(feature: Any) -> MapChange:
     old_points = None
     if kind == "moved" and "old" in properties:
         old_points = _read_points(properties["old"])
-    # Drives confirm that an element is removed if they do not see it.
+    # A drive that does not detect an element confirms that it is removed.
     count_key = "passes_not_seen" if kind == "removed" else "passes_seen"
     return MapChange(
         kind=kind,
@@ -128,7 +128,7 @@ def _read_feature(feature: Any) -> MapChange:
 
 
 def _read_amount(properties: Mapping[str, Any], key: str) -> float | None:
-    """Read a number of at least 0; None if there is none."""
+    """Read a number of at least 0; None if the key is missing."""
     value = properties.get(key)
     if value is None:
         return None
@@ -187,7 +187,7 @@ def _read_points(positions: Any) -> FloatArray:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a value is a number and no truth value."""
+    """Whether a value is a number and not a boolean."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 

@@ -1,4 +1,4 @@
-"""Precision and recall of the changes of a map, and the samples that have a change in range."""
+"""Precision and recall of found map changes, and grouping of samples by changes in their range."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,11 +16,12 @@ from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.errors import InputError
 
 NEAR_M = 1.5
-"""Largest distance between a found and a true change, the loosest threshold of AP_chamfer."""
+"""Largest distance in metres between a found and a true change that match. It is the loosest
+threshold of AP_chamfer."""
 MIN_VIEWS = 5
-"""Smallest number of samples that have a point in range, for the point to be in view."""
+"""A point is in view if it is in the range of at least this number of samples."""
 SHORTEST_M = 5.0
-"""Length of the shortest part of a line in view that must be found."""
+"""A changed line must be found if at least this length of it, in metres, is in view."""
 WANTED_RECALL = 0.6
 CHANGED = "changed"
 UNCHANGED = "unchanged"
@@ -28,7 +29,7 @@ UNCHANGED = "unchanged"
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Ranges of the samples of one map.
+    """Poses of the samples of one map, and the range that each sample covers.
 
     Attributes:
         frame_from_global: Transforms from the global frame to the samples, in metres. (S, 4, 4)
@@ -65,7 +66,7 @@ class Views:
 
 
 def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
-    """Ranges of the samples of an annotation file, by the name of their map."""
+    """Collect the views of the samples of an annotation file, by the name of their map."""
     poses: dict[str, list[FloatArray]] = {}
     for sample in annotations:
         poses.setdefault(sample.map_name, []).append(_level(sample.global_from_frame))
@@ -78,7 +79,7 @@ def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
 
 
 def _level(pose: FloatArray) -> FloatArray:
-    """Pose in the plane: its position and yaw, without height, roll and pitch. (4, 4)"""
+    """Remove height, roll and pitch from a pose. (4, 4) -> (4, 4)"""
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
     level = np.eye(4)
     level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -89,7 +90,7 @@ def _level(pose: FloatArray) -> FloatArray:
 def with_map_names(
     changes: Iterable[MapChange], map_names: Sequence[str], where: str
 ) -> list[MapChange]:
-    """Give the name of the only map to changes that do not name their map.
+    """Complete changes that do not name their map with the name of the only map.
 
     Args:
         changes: Changes of a file.
@@ -120,7 +121,7 @@ def changed_samples(changes: Sequence[MapChange], annotations: AnnotationFile) -
         annotations: The samples.
 
     Returns:
-        ``changed`` or ``unchanged`` of each sample, by token.
+        ``"changed"`` or ``"unchanged"`` for each sample, by token.
     """
     views = views_by_map(annotations)
     changes = with_map_names(changes, sorted(views), where="the file")
@@ -155,24 +156,24 @@ def change_figures(
 ) -> dict[str, float]:
     """Compute precision and recall of changes.
 
-    A found change is correct if half of its length lies within `NEAR_M` of true changes of its map,
-    class and kind. A true change must be found if it is in view. This means that at least
-    `SHORTEST_M` of a line, or half of the outline of an area, is in the range of at least
-    `MIN_VIEWS` samples. A true change is found if half of its length in view lies within `NEAR_M`
-    of found changes of its map, class and kind.
+    A found change is correct if half of its length lies within `NEAR_M` of true changes of equal
+    map, class and kind. A true change counts only if it is in view: at least `SHORTEST_M` of a
+    line, or half of the outline of an area, must be in the range of at least `MIN_VIEWS` samples.
+    Such a change is found if half of its length in view lies within `NEAR_M` of found changes of
+    equal map, class and kind.
 
     Args:
         found: Changes found by a model.
         truth: All true changes.
-        annotations: Samples of the drives that found the changes.
+        annotations: Samples of the drives in which the changes were found.
         found_file: File of the found changes, for messages.
 
     Returns:
         Figures by key. ``precision`` and ``recall`` exist for each kind, for ``all`` kinds, and for
-        ``any_kind``, where kinds are not compared; they are -1 if there is no change to count.
-        ``num_found`` and ``num_true`` are the numbers of changes of each kind and of all.
-        ``all/precision_at_recall_0.6`` is the largest precision over the thresholds of confidence
-        with a recall of at least 0.6, -1 if there is no such threshold.
+        ``any_kind``, where kinds need not be equal. They are -1 if there is no change to count.
+        ``num_found`` and ``num_true`` are the numbers of changes of each kind and of all
+        kinds. ``all/precision_at_recall_0.6`` is the largest precision over all confidence
+        thresholds with a recall of at least 0.6; -1 if there is no such threshold.
 
     Raises:
         ValueError: If the map of a found change is unknown.
@@ -209,13 +210,13 @@ def change_figures(
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Matches of F found changes and T targets.
+    """Matches of F found changes and T targets, the true changes that must be found.
 
     Attributes:
         hits: Whether each found change is correct. (F,)
         confidences: Confidence of each found change. (F,)
-        limits: Largest threshold of confidence at which each target is found, if only found changes
-            with at least this confidence count; -1 if the target is not found. (T,)
+        limits: Largest confidence threshold at which each target is found, where found changes
+            below the threshold do not count; -1 if the target is not found. (T,)
     """
 
     hits: BoolArray
@@ -255,7 +256,7 @@ def _has_kind(changes: Sequence[MapChange], kind: str) -> BoolArray:
 
 
 def _mean(values: BoolArray) -> float:
-    """Share of true values; -1 without values."""
+    """Share of values that are True; -1 without values."""
     return float(values.mean()) if len(values) else UNDEFINED
 
 
@@ -265,9 +266,9 @@ def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[Map
     for change in truth:
         if change.map_name not in views:
             continue
-        points = change.samples()  # points along the change, not samples of the annotation file
+        points = change.samples()  # points in equal steps along the change
         in_view = points[views[change.map_name].count(points) >= MIN_VIEWS]
-        # The points are `STEP_M` apart, so numbers of points stand for lengths.
+        # The points are `STEP_M` apart, so lengths are compared as numbers of points.
         least_points = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M
         if len(in_view) >= max(least_points, 1):
             targets[change] = in_view
@@ -275,7 +276,7 @@ def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[Map
 
 
 def _is_correct(change: MapChange, truth: Sequence[MapChange], same_kind: bool) -> bool:
-    """Whether half of a found change lies near true changes of its map and class."""
+    """Whether half of a found change lies near true changes that it may match."""
     lines = []
     for other in truth:
         if _may_match(change, other, same_kind):
@@ -291,7 +292,7 @@ def _is_correct(change: MapChange, truth: Sequence[MapChange], same_kind: bool) 
 def _confidence_limit(
     target: MapChange, in_view: FloatArray, found: Sequence[MapChange], same_kind: bool
 ) -> float:
-    """Largest threshold of confidence at which a true change is found; -1 if it is not found.
+    """Compute the largest confidence threshold at which a true change is found; -1 if it is not.
 
     Found changes with a confidence below the threshold do not count.
 
@@ -302,14 +303,14 @@ def _confidence_limit(
         same_kind: Whether kinds must be equal.
     """
     points = shapely.points(in_view)
-    best = np.full(len(points), -1.0)
+    best = np.full(len(points), -1.0)  # largest confidence of the found changes near each point
     for change in found:
         if _may_match(target, change, same_kind):
             is_near = shapely.dwithin(points, shapely.LineString(change.points), NEAR_M)
             best[is_near] = np.maximum(best[is_near], change.confidence)
-    # The target is found if half of its points, rounded up, are near changes that count. At the
-    # confidence of rank `half`, in falling order, this is just the case.
-    half = -(-len(best) // 2)
+    # The target is found if at least half of its points are near changes that count. The largest
+    # threshold with this property is therefore number `half` of the confidences in falling order.
+    half = -(-len(best) // 2)  # rounded up
     falling_confidences = np.sort(best)[::-1]
     return float(falling_confidences[half - 1])
 

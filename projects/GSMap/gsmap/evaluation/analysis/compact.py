@@ -1,4 +1,4 @@
-"""Compact result files, whose Bezier curves approximate the points of the original file."""
+"""Compaction of result files: Bezier curves that approximate the points of the elements."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -43,8 +43,8 @@ def compact_results(
 ) -> Compaction:
     """Write a result file with piecewise Bezier curves, which all readers of GSMap accept.
 
-    A curve replaces the points of a vector and the Gaussians of the points. Other entries are kept.
-    A vector of one point is not changed.
+    A vector is the JSON object of one element. A curve replaces its points and the Gaussians of
+    the points; other entries are kept. A vector with fewer than two points is not changed.
 
     Args:
         results: Path of the result file.

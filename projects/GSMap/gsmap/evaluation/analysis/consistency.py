@@ -1,7 +1,7 @@
 """Consistency over the frames of a drive: tracks, C-mAP of MapTracker, jitter of vertices.
 
-C-mAP is an mAP whose matches must also continue the track of their ground truth.
-The rules equal MapTracker's public code. They differ from AP_chamfer in four ways:
+C-mAP (consistent mAP) is an mAP in which a match must also continue the predicted track of its
+ground truth. The rules follow MapTracker's public code. They differ from AP_chamfer in four ways:
 predictions with a score of 0.4 or less are left out, a frame without ground truth of a class does
 not count for the class, lines have 200 points, and two lines can match even if the strips of 4 m
 width around them do not touch.
@@ -24,8 +24,8 @@ from gsmap.structures.polylines import resample_all
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.errors import InputError
 
-TRACK_POINTS = 20
-CHAMFER_POINTS = 200
+TRACK_POINTS = 20  # number of points of a line to track
+CHAMFER_POINTS = 200  # number of points of a line for Chamfer distances
 _LONG_PX = 200  # longer side of a mask
 _SHORT_PX = 100  # shorter side of a mask
 _LINE_PX = 3  # width of a line
@@ -45,8 +45,8 @@ class ConsistencyConfig:
         min_score: Score that predictions must exceed, in [0, 1].
         look_back: Number of earlier frames from which a predicted track may continue, >= 1.
         min_iou: IoU that neighbouring predictions of a track must exceed.
-        min_truth_iou: IoU that neighbouring ground truths of a track must exceed; their tracks
-            continue from the previous frame alone.
+        min_truth_iou: IoU that neighbouring ground truths of a track must exceed. Tracks of ground
+            truth continue from the previous frame only.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -73,16 +73,16 @@ class ConsistencyConfig:
 
 @dataclass
 class DriveFrame:
-    """Frame of a drive; the frames of a scene are in the order of their times.
+    """Frame of a drive with predictions and ground truth.
 
     Args:
         token: Name of the frame.
         scene: Name of the scene.
         pose: Transform from the annotation frame to the world, in metres. (4, 4)
-        predictions: Predicted elements, in metres in the annotation frame. N in number.
+        predictions: N predicted elements, in metres in the annotation frame.
         truth: Annotated elements, in metres in the annotation frame.
-        track_ids: Track of each prediction within scene and class, -1 for none; None to create
-            tracks. (N,)
+        track_ids: Number of the track of each prediction within scene and class, -1 for a
+            prediction without a track. None means that tracks are to be created. (N,)
         lines: Lines to track, in metres in the annotation frame (`with_lines`). (n, 20, 2)
         labels: Class index of each line to track. (n,)
     """
@@ -178,6 +178,8 @@ def partners(
 ) -> dict[int, int]:
     """Assign the lines of a frame to the lines of an earlier frame by the IoU of their masks.
 
+    The assignment has the largest sum of IoUs. Pairs with a low IoU are left out.
+
     Args:
         now: Current frame.
         then: Earlier frame.
@@ -211,11 +213,12 @@ def make_tracks(
 ) -> list[IntArray]:
     """Create the tracks of the lines of one scene.
 
-    A line continues the track of its partner in the nearest earlier frame, if no line of its class
-    in the current frame has this track. Otherwise, a track begins.
+    A line continues the track of its partner, the line of an earlier frame that it is assigned to
+    (`partners`), unless another line of its class in the current frame already has this track.
+    Nearer frames come first. A line that continues no track begins a new one.
 
     Args:
-        frames: Frames of the scene, with ``lines`` and ``labels``.
+        frames: Frames of the scene in the order of their times, with ``lines`` and ``labels``.
         config: Rules of the tracks.
         look_back: Number of earlier frames from which a track may continue.
         min_iou: IoU that neighbouring lines of a track must exceed.
@@ -247,7 +250,7 @@ def make_tracks(
 
 
 def with_lines(frame: DriveFrame, elements: MapElements) -> DriveFrame:
-    """Return a copy of a frame with the lines of some elements to track."""
+    """Return a copy of a frame whose ``lines`` to track are the lines of ``elements``."""
     lines = _resample(elements, num_points=TRACK_POINTS)
     return replace(frame, lines=lines, labels=np.asarray(elements.labels))
 
@@ -278,7 +281,7 @@ def track_drive(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list
 
 
 def tracks_of(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list[IntArray]:
-    """Return the tracks of the predictions of one scene, or create them in frames without tracks.
+    """Return the tracks of the predictions of one scene; create them where ``track_ids`` is None.
 
     Args:
         frames: Frames of the scene.
@@ -317,14 +320,14 @@ def _chamfer_lines(elements: MapElements, simplify: bool) -> kernels.Lines:
 
 @dataclass(frozen=True)
 class FrameHits:
-    """Predictions of one class in a frame with ground truth of the class, best first.
+    """Predictions of one class in a frame, best first, each with its nearest ground truth.
 
     Args:
         scores: Score of each prediction. (N,)
         tracks: Track of each prediction. (N,)
         nearest: Track of the ground truth nearest to each prediction. (N,)
         rows: Index of this ground truth in the frame. (N,)
-        distances: Chamfer distance of this ground truth in metres. (N,)
+        distances: Chamfer distance to this ground truth in metres. (N,)
     """
 
     scores: FloatArray
@@ -334,13 +337,13 @@ class FrameHits:
     distances: FloatArray
 
     def hits(self, threshold: float, owners: dict[int, int] | None) -> BoolArray:
-        """Compute whether each prediction matches.
+        """Decide which predictions match their nearest ground truth.
 
         Args:
             threshold: Largest Chamfer distance of a match, in metres.
-            owners: Predicted track of each ground-truth track, from earlier frames. Updated in
-                place. A match must continue the predicted track of its ground truth. None for plain
-                AP, which ignores tracks.
+            owners: For each track of ground truth, the predicted track of its first match in this
+                and earlier frames. Updated in place. Later matches must have this predicted track.
+                None for plain AP, which ignores tracks.
 
         Returns:
             Whether each prediction matches. (N,)
@@ -362,15 +365,15 @@ class FrameHits:
 
 
 def _number_untracked(tracks: Sequence[IntArray]) -> list[IntArray]:
-    """Give each prediction of a scene without a track a unique number below -1. (N,) each
+    """Give each untracked prediction of a scene a unique number below -1. (N,) each
 
-    Numbers that differ keep such a prediction from continuing the track of another one.
+    Because the numbers differ, an untracked prediction cannot continue the track of another one.
     """
     numbered = []
     last = -1
     for frame_tracks in tracks:
         is_untracked = frame_tracks < 0
-        numbers = last - is_untracked.cumsum()  # last - 1, last - 2, ... without a track
+        numbers = last - is_untracked.cumsum()  # last - 1, last - 2, ... if untracked
         numbered.append(np.where(is_untracked, numbers, frame_tracks))
         last -= int(is_untracked.sum())
     return numbered
@@ -386,8 +389,8 @@ def score_scene(
         config: Rules of the metric.
 
     Returns:
-        For each class, a list of the hits of each frame that has ground truth of the class; and the
-        number of ground truths of each class (C,).
+        For each class, a list with the `FrameHits` of each frame that has ground truth of the
+        class; and the number of ground truths of each class (C,).
     """
     truth_frames = [with_lines(frame, frame.truth) for frame in frames]
     truth_tracks = make_tracks(
@@ -423,10 +426,10 @@ def score_scene(
 
 
 def jitter(frames: Sequence[DriveFrame], tracks: Sequence[IntArray], grid: BEVGrid) -> FloatArray:
-    """Compute how far lines with a track move over the ground between consecutive frames.
+    """Compute how far tracked lines move over the ground between consecutive frames.
 
-    Points of the earlier line that are inside the current map are compared with the nearest point
-    of the current line.
+    The distance of two lines is the mean distance from the points of the earlier line inside the
+    current map range to the nearest points of the current line.
 
     Args:
         frames: Frames of one scene.
@@ -467,7 +470,7 @@ def group_by_scene(frames: Iterable[DriveFrame]) -> list[list[DriveFrame]]:
 
 
 def consistency(frames: Iterable[DriveFrame], config: ConsistencyConfig) -> dict[str, float]:
-    """Compute C-mAP, mAP by equal rules without consistency, and jitter.
+    """Compute C-mAP, an mAP by the same rules but without tracks, and jitter.
 
     Args:
         frames: Frames of all scenes; the frames of a scene are in the order of their times.

@@ -14,8 +14,10 @@ from gsmap.structures.polylines import is_closed
 
 SHORTEST_M = 1.0  # pieces of lines below this, and pieces of areas below 1 m^2, are left out
 _SEPARATOR = " at "
-# The limits of the bands begin with 0, the vehicle, and end with infinity. The others are circles.
+# `DISTANCES_M` are the limits of the distance bands. The first is 0 and the last is infinity. The
+# others are the radii of the circles.
 _RADII_M = DISTANCES_M[1:-1]
+# Names of the bands, from the nearest to the farthest.
 _BANDS = [
     *(f"{inner_m:g}-{outer_m:g} m" for inner_m, outer_m in pairwise((0.0, *_RADII_M))),
     f"beyond {_RADII_M[-1]:g} m",
@@ -26,12 +28,12 @@ def cut_by_distance(samples: Iterable[Sample], areas: Sequence[int]) -> Iterator
     """Cut the map of each sample along circles around the vehicle.
 
     Args:
-        samples: Samples in metres around the vehicle.
+        samples: Samples with coordinates in metres, with the vehicle at the origin.
         areas: Labels of the classes that are areas; the others are lines.
 
     Yields:
-        For each sample a new sample per band, with the pieces in the band. A piece has the label
-        and the score of its element.
+        For each sample, one new sample per distance band, with the pieces of elements in the band.
+        A piece has the label and the score of its element.
     """
     for token, predictions, truth in samples:
         pred_bands = _split_by_band(predictions, areas)
@@ -46,9 +48,9 @@ def distance_groups(tokens: Iterable[str]) -> Groups:
 
 
 def _split_by_band(elements: MapElements, areas: Sequence[int]) -> list[MapElements]:
-    """Return the pieces of all elements in each band."""
+    """Cut all elements, and return the pieces in each band."""
     pieces: list[list[FloatArray]] = [[] for _ in _BANDS]
-    owners: list[list[int]] = [[] for _ in _BANDS]
+    owners: list[list[int]] = [[] for _ in _BANDS]  # row of the element of each piece
     for row, (points, label, _) in enumerate(elements.with_coordinates(2).rows):
         cut = cut_area if label in areas else cut_line
         for band, piece in cut(points):
@@ -68,15 +70,16 @@ def cut_line(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     """Cut a line where it crosses the circles.
 
     Args:
-        points: Vertices in metres around the vehicle. (n, 2)
+        points: Vertices in metres, with the vehicle at the origin. (n, 2)
 
     Yields:
-        Index of the band and vertices (m, 2) of each piece of at least ``SHORTEST_M``. The first
-        and the last piece of a ring are joined if they are in one band.
+        Index of the band and vertices (m, 2) of each piece that is at least ``SHORTEST_M`` long.
+        The first and the last piece of a ring are joined if they are in one band.
     """
     if len(points) < 2:
         return
     positions = _cut_positions(points)
+    # No part between two positions crosses a circle, so its middle determines its band.
     middles = (positions[1:] + positions[:-1]) / 2
     vertices = _interpolate(points, positions)
     middle_x, middle_y = _interpolate(points, middles).T
@@ -100,10 +103,10 @@ def cut_line(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
 def _cut_positions(points: FloatArray) -> FloatArray:
     """Find the positions of the vertices of a line and of its crossings with the circles.
 
-    Position i + s is the point at share s, in [0, 1], of the segment from vertex i to i + 1.
+    The position i + s is at the share s, in [0, 1], of the segment from vertex i to vertex i + 1.
 
     Args:
-        points: Vertices in metres around the vehicle. (n, 2)
+        points: Vertices in metres, with the vehicle at the origin. (n, 2)
 
     Returns:
         Positions in [0, n - 1], sorted.
@@ -135,15 +138,17 @@ def cut_area(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     """Cut an area along the circles.
 
     Args:
-        points: Outline in metres around the vehicle. (n, 2)
+        points: Outline in metres, with the vehicle at the origin. (n, 2)
 
     Yields:
-        Index of the band and closed outline (m, 2) of each piece of at least ``SHORTEST_M``
-        squared.
+        Index of the band and closed outline (m, 2) of each piece with an area of at least
+        ``SHORTEST_M`` squared.
     """
     if len(np.unique(points, axis=0)) < 3:
         return
-    # An outline that crosses itself becomes a collection of areas, multi-areas and lines.
+    # `make_valid` converts an outline that crosses itself to a collection of polygons,
+    # multi-polygons and lines. The second `get_parts` splits the multi-polygons. Lines are left
+    # out, as their area is 0.
     collection = shapely.make_valid(shapely.Polygon(points))
     members = shapely.get_parts(collection)
     parts = shapely.get_parts(members)

@@ -1,4 +1,7 @@
-"""Drives of a result file: reading and writing of tracks, and evaluation of consistency."""
+"""Reading of the drives of a result file, writing of their tracks, and evaluation of consistency.
+
+A track is the number of one map element over the frames of a drive.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,8 +32,8 @@ def drive_frames(
     """Read the frames of all drives, in the order of scenes and times.
 
     Args:
-        results: Path of the result file in MapTR's JSON form. If its vectors have a ``track_id``,
-            the frames have these tracks.
+        results: Path of the result file in MapTR's JSON form. Tracks are read from the ``track_id``
+            of its vectors, if they have one.
         annotations: Ground truth with poses and with all samples of each scene.
         classes: Names of the classes; a label is an index into them.
 
@@ -45,7 +48,7 @@ def drive_frames(
 def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFrame]:
     """Read the frames of all drives, as `drive_frames` does.
 
-    All of ``samples`` is read, so ``samples.about``, the metadata of the file, is set afterwards.
+    Afterwards, ``samples.about`` (the metadata of the file) is set, because all samples are read.
     """
     if not annotations.meta.options.get("poses", True):
         raise InputError(f"{annotations.path} knows no poses, which consistency needs.")
@@ -54,9 +57,9 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
     track_ids: dict[str, IntArray | None] = {}
     last_token: dict[bool, str] = {}  # last sample with tracks (True) and without (False)
     items = items_of(results, RESULTS_KEY, "give a result file")
-    # The file is read twice in step: `samples` checks and converts each item, `items` yields it as
-    # it is, with its tracks. `samples` must be the first argument of `zip`, which is advanced
-    # first: if an item is malformed, `samples` raises the error before `item` is used.
+    # The file is read by two iterators in step. `samples` checks and converts each item; `items`
+    # yields the unchanged item with its tracks. `zip` advances its first argument first. This must
+    # be `samples`, so that it raises the error of a malformed item before the item is used.
     for (token, elements, _), (item, _) in zip(samples, items, strict=True):
         values = [vector.get(TRACK_KEY) for vector in item["vectors"]]
         ids = _convert_tracks(values, results=results, token=token)
@@ -112,7 +115,7 @@ def _convert_tracks(values: list[object], results: Path, token: str) -> IntArray
 
 def _check_tracks(ids: IntArray, elements: MapElements, results: Path, token: str) -> None:
     """Raise ValueError if two elements of a class have equal tracks."""
-    # A column of `pairs` is a label and a track. Each pair that occurs has one column.
+    # The columns of `pairs` are the distinct pairs (label, track).
     pairs, counts = np.unique([elements.labels, ids], axis=1, return_counts=True)
     tracks = pairs[1]
     repeated = tracks[(counts > 1) & (tracks >= 0)]
@@ -129,13 +132,13 @@ def write_tracks(
     config: ConsistencyConfig,
     about: Mapping[str, Any],
 ) -> None:
-    """Write results in which each element has its track, the integer ``track_id``.
+    """Write results in which each element has its track as the integer ``track_id``.
 
     Args:
         path: Path of the result file.
-        frames: Frames of all drives. Tracks are created by `tracks_of` where a frame has none;
-            they persist over the frames of a scene. An element whose score is not above
-            ``config.min_score`` then has the track -1.
+        frames: Frames of all drives. For frames without tracks, `tracks_of` creates tracks that
+            persist over the frames of a scene. Elements whose score is not above
+            ``config.min_score`` then have the track -1.
         config: Rules of the tracks.
         about: Metadata of the results.
     """

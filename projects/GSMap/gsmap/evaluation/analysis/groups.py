@@ -20,7 +20,7 @@ from gsmap.utils.files import read_json
 
 CONDITIONS = ("clear", "cloudy", "dusk", "night", "rain")
 """Words for weather and light in the descriptions of scenes, in nuScenes and MiniCity."""
-OTHERWISE = "day"  # group of a scene without such a word: nuScenes does not describe dry days
+OTHERWISE = "day"  # group of a scene without such a word; nuScenes has no word for a dry day
 _COLUMNS = {"scene": "scene", "map": "map_name"}
 _LONGEST = 80  # characters of the name of a group
 
@@ -41,17 +41,18 @@ class Groups:
         return sorted(set(self.group_of.values()))
 
     def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
-        """Return one resample per group, which has the samples of this group once and no others.
+        """Return one resample per group, with each sample of the group once and no other sample.
 
-        Thus, the AP in a resample (`bootstrap.resampled_figures`) is the AP of a group. The method
-        implements the interface `bootstrap.Weights`, and its name is from there: nothing is drawn.
+        Thus, the AP in a resample (`bootstrap.resampled_figures`) is the AP of a group. The name of
+        the method comes from the interface `bootstrap.Weights`, which it implements. Nothing is
+        drawn at random.
 
         Args:
             tokens: Tokens of the samples. (S,)
 
         Returns:
-            Index of the group of each sample (S,), and number of copies in each resample (rows) of
-            each group (columns), the identity matrix. (G, G)
+            Index of the group of each sample, (S,), and the number of copies of each group
+            (columns) in each resample (rows), which is the identity matrix, (G, G).
 
         Raises:
             ValueError: If the group of a sample is unknown.
@@ -70,9 +71,10 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
 
     Args:
         annotations: Path of the annotation file.
-        by: ``scene``, ``map``, or a JSON file with the group of each scene or of each sample. The
-            ``scene.json`` of nuScenes is accepted, too; its descriptions contain weather and night.
-            A GeoJSON file of changes groups samples by whether a change lies in their range.
+        by: ``scene``, ``map``, or a JSON file with the group of each scene or of each sample. With
+            the ``scene.json`` of nuScenes, samples are grouped by the words for weather and light
+            in its descriptions. With a GeoJSON file of changes, samples are grouped by whether a
+            change lies in their range.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -136,15 +138,16 @@ def _conditions(description: object) -> str:
 def ap_by_group(reports: Sequence[MetricReport], groups: Groups) -> dict[str, dict[str, float]]:
     """Compute every AP over the samples of each group alone.
 
-    An evaluation of a file that has only the samples of a group gives the same AP. Predictions are
-    not matched again: the matches of the reports are used.
+    The AP of a group equals the AP of an evaluation of its samples alone. Predictions are not
+    matched again, because the reports contain the matches.
 
     Args:
         reports: Reports of all metrics over all samples.
         groups: Groups of the samples.
 
     Returns:
-        AP by name of the group and flat key; -1 where it does not exist.
+        AP in [0, 1] by name of the group and flat key, such as ``chamfer/mAP``; -1 where it is
+        undefined.
     """
     group_aps: dict[str, dict[str, float]] = {}
     for name in groups.names:
@@ -180,7 +183,8 @@ def group_table(
         group_aps: Figures of `ap_by_group`.
 
     Returns:
-        Head and rows; columns are the name, the samples, and the mean and classes of each metric.
+        Head and rows of the table. The columns are the name of the group, the number of samples,
+        and for each metric the mAP and the AP of each class.
     """
     head = ["", "samples"]
     keys = []

@@ -22,7 +22,7 @@ from gsmap.structures.polylines import resample_all
 from gsmap.utils.errors import InputError
 from gsmap.utils.split_lists import require_same_list
 
-_MIN_PRECISION = 1e-3  # below one match in a thousand samples, an element adds nothing
+_MIN_PRECISION = 1e-3  # the fit ends if an element matches in fewer than 1 of 1000 samples
 _REFINEMENTS = 3  # iterations that move an element to the mean of its matches
 _NUM_POINTS = 20  # points of each element
 _MAX_CANDIDATES = 400  # candidates of a class, drawn at random
@@ -77,7 +77,8 @@ class _ClassFit:
             if len(frame):
                 self.frames.append(frame)
                 lines.append(resample_all(frame.points, frame.offsets, num_points=_NUM_POINTS))
-        # Index of the first ground truth of each frame; the last entry is their number K. (F + 1,)
+        # Index of the first ground truth of each frame. The last entry is the number K of ground
+        # truths in all frames. (F + 1,)
         self.first = np.cumsum([0, *map(len, self.frames)])
         self.points = np.concatenate(lines)  # ground truths of all frames, (K, P, 2 or 3)
         self.is_taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)  # (T, K)
@@ -107,7 +108,15 @@ class _ClassFit:
         return nearest, distance
 
     def _new_hits(self, nearest: IntArray, distance: FloatArray) -> FloatArray:
-        """Count the free ground truths that each line matches, averaged over thresholds. (N,)"""
+        """Count the ground truths that each line matches and that are not taken yet.
+
+        Args:
+            nearest: Index of the nearest ground truth in each frame, or -1. (..., F)
+            distance: Its Chamfer distance in metres. (..., F)
+
+        Returns:
+            Numbers of ground truths, averaged over the thresholds. (...)
+        """
         hits = []
         for t, threshold in enumerate(self.thresholds):
             # Without a ground truth in reach, ``nearest`` is -1, which reads the last entry of
@@ -230,7 +239,8 @@ def evaluate_prior(
             chamfer = metric
     all_train, _ = read_ground_truth(train_path, evaluator.classes)
     step = max(1, math.ceil(len(all_train) / _MAX_TRAINING_SAMPLES))
-    train = dict(list(all_train.items())[::step])
+    train_items = list(all_train.items())[::step]
+    train = dict(train_items)
     truth, _ = read_ground_truth(truth_path, evaluator.classes)
     prior = fit_prior(list(train.values()), chamfer=chamfer, max_elements=max_elements)
 

@@ -1,8 +1,8 @@
 """Average precision of ranked predictions, and the calibration of their scores.
 
 Three definitions of AP are in use: the area under the precision envelope (VOC 2010, MapTR), the
-mean of the envelope at 101 recalls (COCO), and its mean at ten recalls (methods with AP per
-sample).
+mean of the envelope at 101 recalls (COCO), and the mean of the envelope at ten recalls (methods
+whose evaluators compute AP per sample).
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ def precision_recall(hits: BoolArray, num_gts: int) -> tuple[FloatArray, FloatAr
 
 
 def _envelope(precision: FloatArray) -> FloatArray:
-    """Precision envelope: the largest precision after this or a later prediction. (N,)"""
+    """Precision envelope: the largest precision at each prediction or a later one. (N,)"""
     envelope: FloatArray = np.maximum.accumulate(precision[::-1])[::-1]
     return envelope
 
@@ -66,8 +66,8 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
     true_positives = np.cumsum(hits, dtype=np.float64)
     # COCO adds the spacing of 1 to the denominator, so a perfect class gives 1 - 2e-16.
     precision = true_positives / (np.arange(1, len(true_positives) + 1) + np.spacing(1.0))
-    # Index of the first prediction that reaches each recall. Where no prediction does, it is the
-    # number of predictions, at which the appended precision of 0 is.
+    # Index of the first prediction that reaches each recall. If no prediction reaches it, the index
+    # is N, and `np.append` adds a precision of 0 there.
     ranks = np.searchsorted(true_positives / num_gts, _RECALL_POINTS, side="left")
     return float(np.append(_envelope(precision), 0.0)[ranks].mean())
 
@@ -75,8 +75,8 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
 def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
     """Compute the mean of the precision envelope at the recalls 0.1, 0.2, ... 1.
 
-    The public evaluators of the methods compare recalls in float32, where 7 matches of 10 are less
-    than the recall 0.7. Here, both are equal.
+    The public evaluators of the methods compare recalls in float32, in which 7 matches out of 10 do
+    not reach the recall 0.7. Here they do.
 
     Args:
         hits: Whether each prediction matches, in the order in which predictions count. (N,)
@@ -86,14 +86,15 @@ def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
         AP in [0, 1].
     """
     _, precision = precision_recall(hits, num_gts)
-    min_true_positives = -(-np.arange(1, 11) * num_gts // 10)  # rounded up
+    # Matches that reach each recall: recall * num_gts, rounded up.
+    min_true_positives = -(-np.arange(1, 11) * num_gts // 10)
     # As in `interpolated_ap`: the precision is 0 at recalls that no prediction reaches.
     ranks = np.searchsorted(np.cumsum(hits), min_true_positives, side="left")
     return float(np.append(_envelope(precision), 0.0)[ranks].mean())
 
 
 def reliability(scores: FloatArray, hits: BoolArray) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Compare scores with the share of predictions that match, in ten equal bins.
+    """Compare scores with the share of predictions that match, in ten bins of equal width.
 
     Args:
         scores: Confidence of each prediction in [0, 1]. (N,)
@@ -104,7 +105,7 @@ def reliability(scores: FloatArray, hits: BoolArray) -> tuple[FloatArray, FloatA
         not empty. (<= 10,) each
     """
     bins = np.clip((scores * 10).astype(np.int64), 0, 9)
-    # Number the bins that are not empty.
+    # Give consecutive numbers to the bins that are not empty.
     _, bins, counts = np.unique(bins, return_inverse=True, return_counts=True)
     score_sums = np.bincount(bins, weights=scores)
     hit_sums = np.bincount(bins, weights=hits)

@@ -7,8 +7,8 @@ Rules, equal to MapTR's evaluator:
   within the threshold and no prediction with a higher score has taken the ground truth.
 - Pairs whose 4 m wide strips do not touch never match.
 
-With heights, distances are in space. The points of a resampled line are still at equal distances in
-the plane, with interpolated heights, and strips are compared in the plane.
+With heights, distances are three-dimensional. Lines are still resampled at equal distances in the
+plane, with interpolated heights, and strips are still compared in the plane.
 """
 
 import math
@@ -48,7 +48,7 @@ def checked_thresholds(thresholds: Sequence[float]) -> tuple[float, ...]:
         The distances in ascending order, rounded to micrometres.
 
     Raises:
-        ValueError: If they are no such numbers.
+        ValueError: If there is no distance, or a distance is not a finite number > 0.
     """
     try:
         rounded = sorted(round(float(value), ndigits=6) for value in thresholds)
@@ -62,7 +62,7 @@ def checked_thresholds(thresholds: Sequence[float]) -> tuple[float, ...]:
 @register_metric
 @dataclass(frozen=True)
 class ChamferConfig(Metric):
-    """AP_chamfer and its rules.
+    """Metric AP_chamfer with its rules.
 
     Args:
         classes: Names of the classes; a label is an index into them.
@@ -109,7 +109,7 @@ class ChamferConfig(Metric):
 
     @property
     def counts_heights(self) -> bool:
-        """Whether heights (z) count in the metric: distances are in space, not in the plane."""
+        """Whether heights (z) count, so that distances are three-dimensional."""
         return self.dim == 3
 
     def match(self, sample: Sample) -> FrameMatches:
@@ -139,7 +139,7 @@ class HardChamferConfig(ChamferConfig):
 
 
 def _lines(elements: MapElements, config: ChamferConfig, resample: bool) -> kernels.Lines:
-    """Convert the elements of one sample to the form of the kernels."""
+    """Convert the elements of one sample to the input format of the kernels."""
     points = elements.with_coordinates(config.dim).points  # (M, dim)
     offsets = elements.offsets
     if resample:
@@ -182,8 +182,8 @@ def nearest_by_chamfer(
     """Find the nearest ground truth of each prediction whose strip touches the prediction's strip.
 
     Args:
-        predictions: Predicted elements. N in number.
-        ground_truth: Annotated elements. K in number.
+        predictions: The N predicted elements.
+        ground_truth: The K annotated elements.
         config: Rules of resampling and of heights.
         max_distance: Largest Chamfer distance in metres.
 
@@ -203,6 +203,7 @@ def nearest_by_chamfer(
     for row in np.flatnonzero(has_candidates).tolist():
         line = _line(pred, index=row)
         k = nearest[row]
+        # Exclude the nearest ground truth as long as its strip does not touch the prediction's.
         while np.isfinite(distances[row, k]) and not _strips_touch(line, _line(gt, index=k)):
             distances[row, k] = np.inf
             k = distances[row].argmin()
@@ -289,7 +290,7 @@ def chamfer_report(matches: MatchTable, config: ChamferConfig) -> MetricReport:
 
     Args:
         matches: Matches of all samples by the rules of ``config``.
-        config: Rules of the metric; its name begins the keys of the figures.
+        config: Rules of the metric. Its name is the prefix of the keys of the figures.
     """
     thresholds = dict.fromkeys(config.classes, config.thresholds)
     detections = matches.detections(thresholds)

@@ -1,6 +1,6 @@
 """Compiled inner loops of the Chamfer distance.
 
-Lines are stored as rows of x, y and z, so that the loops vectorise; z is 0 for 2D lines.
+Coordinates are stored as three rows x, y and z, so that the loops vectorise. z is 0 for 2D lines.
 """
 
 import math
@@ -45,9 +45,9 @@ def resample_lines(points: FloatArray, offsets: IntArray, num_points: int) -> Fl
             dy = line[k, 1] - line[k - 1, 1]
             along[k] = along[k - 1] + math.sqrt(dx * dx + dy * dy)
         step = along[-1] / (num_points - 1)
-        k = 0
+        k = 0  # the last vertex at or before the target
         for p in range(num_points):
-            target = p * step if p < num_points - 1 else along[-1]
+            target = p * step if p < num_points - 1 else along[-1]  # arc length of point p
             while k + 1 < len(line) and along[k + 1] <= target:
                 k += 1
             for axis in range(line.shape[1]):
@@ -61,7 +61,10 @@ def resample_lines(points: FloatArray, offsets: IntArray, num_points: int) -> Fl
 
 @njit(cache=True, fastmath=_NO_NAN)
 def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
-    """Compute the mean of both directed mean nearest-neighbour distances of two lines.
+    """Compute the Chamfer distance of two lines.
+
+    It is the mean of two values: the mean distance of the points of each line from their nearest
+    points of the other line.
 
     Args:
         first: Points in metres. (3, P)
@@ -76,7 +79,7 @@ def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
     bx = second[0]
     by = second[1]
     bz = second[2]
-    nearest_to_second = np.full(len(bx), np.inf)  # squared
+    nearest_to_second = np.full(len(bx), np.inf)  # squared distances
     squared = np.empty(len(bx))
     first_sum = 0.0
     for i in range(len(ax)):
@@ -97,7 +100,7 @@ def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
 
 @njit(cache=True, fastmath=_NO_NAN)
 def _mean_distance_to_box(line: FloatArray, box: FloatArray) -> float:
-    """Compute the mean distance in the plane of points (3, P) from a box (x0, y0, x1, y1)."""
+    """Compute the mean distance of points (3, P) from a box (x0, y0, x1, y1), in the plane."""
     x = line[0]
     y = line[1]
     total = 0.0
@@ -125,7 +128,7 @@ def _boxes(points: FloatArray, offsets: IntArray) -> FloatArray:
 
 @njit(cache=True)
 def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) -> bool:
-    """Check whether any of some points projects onto a segment of a line and is close to it.
+    """Check whether at least one point projects onto a segment of a line and is close to it.
 
     A point whose distance is ``half_width_m`` up to rounding errors does not count as close.
 
@@ -161,8 +164,8 @@ def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) 
 def pair_distances(pred: Lines, gt: Lines, max_distance: float) -> FloatArray:
     """Compute the Chamfer distances between lines of equal class.
 
-    The mean distance of the points of a line from the bounding box of the other line, in the plane,
-    is a lower bound. Pairs whose bound exceeds ``max_distance`` are not computed in full.
+    If the nearest points of the other line are replaced by its bounding box in the plane, the
+    result is a lower bound. Pairs whose bound exceeds ``max_distance`` are not computed in full.
 
     Args:
         pred: N predicted lines.

@@ -1,4 +1,4 @@
-"""Evaluation of several metrics over a stream of samples; only the matches stay in memory."""
+"""Evaluation of several metrics over a stream of samples. Only the matches are kept in memory."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -23,9 +23,9 @@ from gsmap.structures.polylines import resample_all
 from gsmap.utils.errors import InputError
 
 METRIC_NAMES = ("chamfer", "raster")
-"""Metrics of published tables, the default."""
+"""Default metrics, the metrics of published tables."""
 SampleMatches = dict[str, Matches]
-"""Records of one sample, by the name of the metric."""
+"""Matches of one sample, by the name of the metric. They are also called records."""
 
 
 @dataclass(frozen=True, init=False)
@@ -37,8 +37,8 @@ class MapEvaluator:
 
     Args:
         *metrics: Metrics, such as ``ChamferConfig(classes)`` and ``RasterConfig(classes)``.
-        ground_truth_points: Number of points to which ground truth is resampled first, such as the
-            20 of the training targets, >= 2; None for full resolution.
+        ground_truth_points: Number of points to which ground truth is resampled first, >= 2.
+            Training targets have 20 points, for example. None keeps the full resolution.
 
     Raises:
         ValueError: If there is no metric, two metrics have equal names, or their classes differ.
@@ -71,8 +71,8 @@ class MapEvaluator:
             names: Names of metrics (`metric_class`). Metrics that are reported together with one
                 of them (`Metric.companions`) are inserted before it.
             settings: Settings from which each metric takes its rules.
-            ground_truth_points: Number of points to which ground truth is resampled first, >= 2;
-                None for full resolution.
+            ground_truth_points: Number of points to which ground truth is resampled first, >= 2.
+                None keeps the full resolution.
 
         Raises:
             ValueError: If there is no metric of a name, or the settings do not suit a metric.
@@ -88,7 +88,7 @@ class MapEvaluator:
 
     @cached_property
     def _matches(self) -> list[SampleMatches]:
-        """Records of the samples so far, in a list that the first use creates."""
+        """Records of the samples so far. The list is created on first use."""
         return []
 
     def update(
@@ -99,14 +99,14 @@ class MapEvaluator:
         Args:
             predictions: Predicted elements, in metres in the annotation frame. N in number.
             ground_truth: Annotated elements at full resolution. K in number.
-            token: Name of the sample; repeated names count once. Default: its number.
+            token: Name of the sample; repeated names count once. Default: the number of the sample.
         """
         if token is None:
             token = f"{len(self._matches):09d}"
         self._matches.append(self.match(token, predictions, ground_truth=ground_truth))
 
     def compute(self) -> dict[str, float]:
-        """Compute the figures of all samples so far, which docs/evaluation.md lists.
+        """Compute the figures of all samples so far (docs/evaluation.md).
 
         Raises:
             ValueError: If there is no sample.
@@ -133,7 +133,7 @@ class MapEvaluator:
 
     @property
     def counts_heights(self) -> bool:
-        """Whether heights (z) count in a metric, as in distances in space."""
+        """Whether a metric uses heights (z), for example in distances in space."""
         return any(metric.counts_heights for metric in self.metrics)
 
     def match(
@@ -151,7 +151,7 @@ class MapEvaluator:
         return self._match_sample(Sample(token, predictions, ground_truth))
 
     def match_empty(self) -> SampleMatches:
-        """Match a sample without elements, for the names and shapes of the records."""
+        """Match a sample without elements, to get the names and shapes of the records."""
         points = np.empty((0, 3))  # with heights, which metrics in space require
         truth = replace(MapElements.from_polylines(), points=points)
         predictions = replace(MapElements.from_polylines(scores=()), points=points)
@@ -193,7 +193,7 @@ class MapEvaluator:
 
 
 def _resample_elements(elements: MapElements, num_points: int) -> MapElements:
-    """Resample each element of two points or more; others stay as they are."""
+    """Resample each element of two points or more. Other elements are kept unchanged."""
     resampled = resample_all(elements.points, elements.offsets, num_points=num_points)
     polylines = []
     for line, resampled_line in zip(elements.polylines, resampled, strict=True):

@@ -25,9 +25,9 @@ from gsmap.utils.shards import WHOLE, Shard
 from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import format_count
 
-_CANVAS_TOLERANCE_M = 0.5  # by which ground truth may leave a canvas without a note
-# Samples per task: enough that few tasks are handed to the processes, and few enough that the work
-# of the processes is balanced.
+_CANVAS_TOLERANCE_M = 0.5  # ground truth that leaves a canvas by less than this gives no note
+# Samples per task of a process. Larger tasks cost less communication, and smaller tasks balance the
+# work of the processes.
 CHUNK = 64
 Evaluation = tuple[list[MetricReport], list[str]]
 """Reports of all metrics, and notes on ignored elements, heights and samples."""
@@ -52,7 +52,7 @@ class AnnotatedTruth:
         missing = [name for name in classes if name not in names]
         if missing:
             raise InputError(f"{path} has the classes {names}, not {missing}.")
-        # The entry of a label of the file is the label in ``classes``, or -1 for other classes.
+        # Index: label in the file. Entry: label in ``classes``, or -1 for other classes.
         self._labels = np.full(len(names), fill_value=-1)
         for label, name in enumerate(names):
             if name in classes:
@@ -117,7 +117,7 @@ def open_ground_truth(
     Args:
         path: Annotation file, or ground truth in MapTR's JSON form.
         classes: Names of the classes; elements of other classes get the label -1.
-        shard: Part of the samples to read of an annotation file; JSON is read as a whole.
+        shard: Part of the samples to read from an annotation file; JSON is read as a whole.
     """
     if Path(path).suffix.lower() == ".json":
         return SampleFile(path, key=GROUND_TRUTH_KEY, classes=classes)
@@ -176,7 +176,7 @@ def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bo
 
 
 class SamplePairs:
-    """Iterable of the samples of a result file and a ground-truth file; iterate once.
+    """Iterable of samples, each with its results and its ground truth; iterate only once.
 
     Few samples are in memory at a time. Where the orders of the files differ, the position of a
     sample in its file is stored, and the sample is read a second time when its partner arrives.
@@ -189,8 +189,9 @@ class SamplePairs:
             counts as without predictions, and results without ground truth are left out. If False,
             a difference raises an error after the last pair.
         shard: Part of the samples of the ground truth to evaluate.
-        allow_other_split: Whether the model of the results may be trained on another split than the
-            annotation file belongs to. If False, this raises an error after the last pair.
+        allow_other_split: Whether the split of the annotation file may differ from the split with
+            which the model was trained and tested. If False, a difference raises an error after the
+            last pair.
         gaussians: Whether to read the Gaussians of results.
     """
 
@@ -215,7 +216,7 @@ class SamplePairs:
             tokens = self._truth.tokens()
             self._other_shards = set(tokens).difference(shard.part(tokens))
         self._mismatches: list[str] = []
-        self._degenerate = 0
+        self._degenerate = 0  # number of ground truths of fewer than two points
         self._low = np.full(2, np.inf)  # bounds of the ground truth
         self._high = np.full(2, -np.inf)
 
@@ -226,8 +227,8 @@ class SamplePairs:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file is malformed or the samples differ.
         """
-        # Samples whose partner is missing so far, on each side. The first CHUNK samples are stored
-        # with their elements, and further ones with their places in the file.
+        # Samples that were read from one file, but not yet from the other. Up to CHUNK of them are
+        # stored with their elements, and further ones with their places in the file.
         pending_results: dict[str, Any] = {}
         pending_truth: dict[str, Any] = {}
         results = self._items_of_shard(self._results)
@@ -273,11 +274,11 @@ class SamplePairs:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Metadata of the result file, after iterating."""
+        """Metadata of the result file; complete after iterating."""
         return self._results.about
 
     def _pair(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
-        """Create a sample; counts ground truths of fewer than two points, and tracks bounds."""
+        """Create a sample, and update the count of degenerate ground truths and the bounds."""
         self._degenerate += int((truth.num_points < 2).sum())
         if len(truth.points):
             points = np.asarray(truth.points)[:, :2]
@@ -355,8 +356,8 @@ def evaluate_files(
         num_workers: Number of processes.
         allow_mismatch: Whether samples of the files may differ. A sample without results counts as
             without predictions, and results without ground truth are left out.
-        allow_other_split: Whether the model may be trained on another split than the annotation
-            file belongs to.
+        allow_other_split: Whether the split of the annotation file may differ from the split with
+            which the model was trained and tested.
 
     Returns:
         Reports of all metrics, and notes on ignored elements, heights and samples.

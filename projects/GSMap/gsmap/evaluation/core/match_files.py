@@ -1,4 +1,4 @@
-"""Files with the matches of a shard of the samples, and the evaluation of all shards."""
+"""Files with the matches of one shard (a part of the samples), and evaluation of all shards."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -34,7 +34,7 @@ def require_own_matches(target: Path, shard: Shard) -> None:
     Raises:
         ValueError: If another program's file has the name of the shard or of its manifest.
     """
-    # The array of notes is the first one in the file, so its name is near the start.
+    # A file of matches is recognised by the name of its first array, which is near the start.
     shard.require_own(target, mark=b"notes.npy")
 
 
@@ -81,7 +81,7 @@ def write_matches(
 
 
 def _join_records(metric: str, records: Sequence[Matches]) -> dict[str, npt.NDArray[Any]]:
-    """Concatenate the arrays of all samples along their first axes."""
+    """Concatenate the arrays of all samples along the first axis, and add their lengths."""
     tokens = []
     columns: dict[str, list[npt.NDArray[Any]]] = {}
     for record in records:

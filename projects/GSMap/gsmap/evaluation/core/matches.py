@@ -26,17 +26,19 @@ _COLUMNS = {  # type codes (Python's `array`) of the columns of a table
 class FrameMatches:
     """Matches of the predictions of one sample, in descending order of score.
 
-    Predictions that a metric leaves out have no entry. Equal scores keep the order of the input.
+    Predictions that a metric leaves out have no entry. Predictions with equal scores keep the order
+    of the input.
 
     Args:
         token: Name of the sample.
         pred_index: Index of each prediction in the input of the metric. (N,)
         labels: Class index. (N,)
         scores: Confidence in [0, 1]. (N,)
-        matched_gt: Index of the matched ground truth in the input of the metric at each threshold,
-            or -1. (N, T)
-        quality: AP_chamfer: distance of the match in metres, NaN without a match at any threshold.
-            AP_raster: IoU of the match at the loosest threshold, NaN without one. (N,)
+        matched_gt: At each threshold, index of the matched ground truth in the input of the metric,
+            or -1 without a match. (N, T)
+        quality: For AP_chamfer, distance of the match in metres, NaN without a match at any
+            threshold. For AP_raster, IoU of the match at the loosest threshold, NaN without a
+            match. (N,)
         num_gts: Number of ground truths of each class. (C,)
         class_iou: IoU of all predictions of a class with all its ground truths, NaN if the sample
             has neither; only AP_raster has it. (C,)
@@ -52,7 +54,10 @@ class FrameMatches:
     class_iou: FloatArray | None = None
 
     def empty_if_one_sided(self) -> "FrameMatches":
-        """Return these matches, or the matches of an empty sample if a side has no element."""
+        """Return the matches of an empty sample if there are no predictions or no ground truths.
+
+        Otherwise, return these matches.
+        """
         if len(self.labels) and self.num_gts.any():
             return self
         no_rows = slice(0, 0)
@@ -75,8 +80,8 @@ class ClassDetections:
         thresholds: Thresholds of a match, ascending: metres for AP_chamfer, IoU for AP_raster. (T,)
         scores: Confidence in [0, 1]. (N,)
         hits: Whether the prediction matches, at each threshold. (N, T)
-        quality: Distance of the match in metres for AP_chamfer, IoU for AP_raster; NaN without one.
-            (N,)
+        quality: Distance of the match in metres for AP_chamfer, IoU for AP_raster; NaN without a
+            match. (N,)
         ranks: Rank of the prediction within its class and sample, from 0. (N,)
         num_gts: Number of ground truths.
         samples: Index of the prediction's sample, in the order of the tokens. (N,)
@@ -172,10 +177,10 @@ def ranked_predictions(
 class MatchTable:
     """Matches of many samples in compact columns.
 
-    Figures do not depend on repeated samples, their order or the number of processes: a token
-    counts once, and equal scores keep the order of the tokens, then the order within the sample.
-    The reference evaluators resolve equal scores by an unstable sort (AP_chamfer) or by the order
-    of the file (AP_raster).
+    Metrics of the table do not depend on repeated samples, on the order of the samples or on the
+    number of processes: a token counts once, and predictions with equal scores are in the order of
+    their tokens, then in their order within the sample. The reference evaluators order equal scores
+    by an unstable sort (AP_chamfer) or by the order of the file (AP_raster).
 
     Args:
         matches: Matches to add.
@@ -229,8 +234,8 @@ class MatchTable:
         num_thresholds = len(next(iter(thresholds.values())))
         order = self._order
 
-        # Rows of the columns, with the samples in the order of their tokens. The rows of one
-        # sample are consecutive in both orders, so all of them have one shift between the orders.
+        # Row in the columns of each prediction, with the samples in the order of their tokens. The
+        # rows of a sample are consecutive in both orders, so they differ by one shift per sample.
         lengths = columns["length"]
         starts = np.cumsum(lengths) - lengths  # first row of each sample in the columns
         sorted_lengths = lengths[order]

@@ -20,7 +20,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
 PACKAGE = Path(gsmap.__file__).parent  # folder of GSMap's code
-_CORE_MODULES = {  # modules in evaluation/core, by the first word of their metrics
+_CORE_MODULES = {  # modules in evaluation/core, by the first word of the names of their metrics
     "chamfer": "gsmap.evaluation.core.chamfer_ap",
     "raster": "gsmap.evaluation.core.raster_ap",
 }
@@ -55,8 +55,9 @@ class SampleValues:
 
     Args:
         token: Name of the sample.
-        values: Arrays by name. An array has an equal shape in all samples, or only the length of
-            its first axis varies; that length is 0 in a sample without elements.
+        values: Arrays by name. The shape of an array is equal in all samples, except that the
+            length of its first axis may vary. A length that varies is 0 in a sample without
+            elements.
     """
 
     token: str
@@ -185,7 +186,7 @@ class Metric(ABC):
 
     @property
     def counts_heights(self) -> bool:
-        """Whether heights (z) count in the metric, as in distances in space. By default False."""
+        """Whether heights (z) count, as in three-dimensional distances; False by default."""
         return False
 
 
@@ -213,8 +214,8 @@ def register_metric(metric: MetricClass) -> MetricClass:
 def metric_class(name: str) -> type[Metric]:
     """Return the class of a metric by its name.
 
-    A name that is not registered yet is looked for in the module of its first words: the name
-    ``chamfer_hard`` imports the module of ``chamfer``.
+    If the name is not registered yet, the module that its first words name is imported. For
+    ``chamfer_hard``, this is the module of ``chamfer``.
 
     Raises:
         ValueError: If there is no metric of this name.

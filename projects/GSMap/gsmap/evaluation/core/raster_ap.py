@@ -39,18 +39,18 @@ MAX_PREDICTIONS = 100  # largest number of predictions of a class in a sample
 RECALL_LIMITS = (1, 10, 100)  # AR@n counts the n best predictions of a class in each sample
 NUSCENES_GRID = BEVGrid(x_range=(-15.0, 15.0), y_range=(-30.0, 30.0))
 _MOST_PX = 2e7  # largest canvas: 560 m by 560 m at 8 pixels per metre
-_FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
+_FAR_PX = 2.0**20  # pixel coordinates are clipped to this, to fit the integers of the drawing
 _GROUP_FIGURES = ("AP", "AR", "recall", "mIoU")  # prefixes of the figures with a mean per group
 
 
 @register_metric
 @dataclass(frozen=True)
 class RasterConfig(Metric):
-    """AP_raster and its rules.
+    """Metric AP_raster and its rules.
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        grid: Extent of the canvas in metres; its raster is not used.
+        grid: Extent of the canvas in metres; its numbers of rows and columns are not used.
         polygon_classes: Names of the classes that are filled; unknown names are allowed.
         px_per_m: Pixels per metre.
         dilation_px: Side in pixels of the square that masks are dilated by; odd.
@@ -95,7 +95,7 @@ class RasterConfig(Metric):
 
     @property
     def thresholds(self) -> dict[str, tuple[float, ...]]:
-        """Smallest IoUs of a match of each class, by its name. C x (T,)"""
+        """The T smallest IoUs of a match for each class, by the name of the class."""
         thresholds: dict[str, tuple[float, ...]] = {}
         for name, is_polygon in zip(self.classes, self.is_polygon, strict=True):
             thresholds[name] = POLYGON_THRESHOLDS if is_polygon else LINE_THRESHOLDS
@@ -193,7 +193,7 @@ def match_raster(
     padded_gt_index = np.append(gt_index, -1)
     padded_ious = np.full((len(rows), len(gt_index) + 1), fill_value=np.nan)
     padded_ious[:, :-1] = ious
-    loosest_match = matched[:, 0]  # at the smallest IoU, the first threshold
+    loosest_match = matched[:, 0]  # match at the first threshold, which is the smallest IoU
     return FrameMatches(
         token=token,
         pred_index=rows,

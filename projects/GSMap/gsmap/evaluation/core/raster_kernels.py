@@ -1,9 +1,9 @@
 """Compiled drawing and comparison of dilated lines and polygons.
 
-Pixels are equal to OpenCV 4.8 to 4.10 (8-connected lines of one pixel, even-odd fill), with which
-the reference figures were computed. Other versions of OpenCV fill different pixels along the
-outline of a polygon, enough to change AP in the third digit. The drawing is implemented here to be
-independent of the version.
+The kernels draw the same pixels as OpenCV 4.8 to 4.10 (8-connected lines of one pixel, even-odd
+fill), with which the reference results were computed. Other versions of OpenCV fill different
+pixels along the outline of a polygon, enough to change AP in the third digit. With these kernels,
+results do not depend on the installed version.
 
 A mask stores 64 pixels of a row in a word: bit b of word w is column 64 w + b.
 """
@@ -42,7 +42,7 @@ def _stamp(mask: WordArray, width: int, row: int, left: int, right: int, radius:
 
 @njit(cache=True)
 def _side(value: int, limit: int) -> int:
-    """Return -1 below 0, 1 above the limit, and 0 between."""
+    """Return -1 for a value below 0, 1 for a value above the limit, and 0 otherwise."""
     if value < 0:
         return -1
     return 1 if value > limit else 0
@@ -180,7 +180,8 @@ def draw(
         offsets: Element i has the points ``offsets[i]:offsets[i + 1]``. (N + 1,)
         filled: Whether each element is a polygon to fill. (N,)
         size: Rows H and columns W of a mask.
-        radius: Number of pixels that each pixel is dilated by: (side - 1) / 2 of the square.
+        radius: Number of pixels that each pixel is dilated by, in all directions. A pixel becomes a
+            square with a side of 2 * radius + 1 pixels.
 
     Returns:
         Masks. (N, H, words), words = ceil(W / 64)
@@ -205,7 +206,8 @@ def draw(
             if not cut[j] or _clip_segment(edges[j, 0], edges[j, 1], height=height, width=width):
                 _draw_segment(masks[i], width, start=edges[j, 0], end=edges[j, 1], radius=radius)
             if edges[j, 0, 1] == edges[j, 1, 1]:
-                # A clipped edge within one row has no slope: `_fill` takes the slope of the whole.
+                # A clipped edge within one row has no slope: `_fill` uses the slope of the whole
+                # edge.
                 edges[j, 0] = start
                 edges[j, 1] = end
         if filled[i] and len(corners):
@@ -227,7 +229,7 @@ def _count(word: int) -> int:
 @njit(cache=True)
 def _count_shared(first: WordArray, second: WordArray) -> int:
     """Count the pixels that are set in both masks."""
-    a = first.ravel()  # one long loop vectorises
+    a = first.ravel()  # the compiler vectorises one long loop
     b = second.ravel()
     total = 0
     for word in range(len(a)):

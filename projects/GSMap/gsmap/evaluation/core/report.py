@@ -27,8 +27,8 @@ class MetricReport:
             does not exist. The keys are listed in docs/evaluation.md.
         detections: Ranked predictions of each class, for curves and intervals.
         tokens: Tokens of the samples, sorted.
-        sample_aps: AP of each class in each sample, for a metric that is the mean over samples; NaN
-            where a sample does not count. C x (S, T)
+        sample_aps: AP of each class in each of S samples at each of T thresholds, for a metric that
+            is the mean over samples; NaN where a sample does not count. (S, T) per class
         by_distance: True if thresholds are distances in metres, and the last one is the loosest;
             False if thresholds are IoUs, and the first one is the loosest.
     """
@@ -128,8 +128,8 @@ def format_table(report: MetricReport) -> str:
         lines += _group_lines(report, group)
     absent = [name for name, ranked in report.detections.items() if not ranked.num_gts]
     some_are_absent = 0 < len(absent) < len(report.detections)
-    # In an AP that is a mean over samples, predictions of an absent class count, so that the class
-    # is not left out.
+    # If the AP is a mean over samples, the predictions of an absent class count. Such a class is
+    # therefore not left out of the means.
     if some_are_absent and not report.sample_aps:
         lines.append(f"without ground truth, left out of the means: {', '.join(absent)}")
     mean_ap = report.metrics[f"{report.name}/mAP"]

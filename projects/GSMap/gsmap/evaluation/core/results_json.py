@@ -1,4 +1,4 @@
-"""Result and ground-truth files in the JSON form of MapTR's evaluator.
+"""Reading and writing of results and ground truth in the JSON form of MapTR's evaluator.
 
 A file of results is ``{"meta": ..., "results": [{"sample_token", "vectors": [{"pts", "pts_num",
 "cls_name", "type", "confidence_level"}]}]}``. A file of ground truth is ``{"GTs": [...]}``, without
@@ -26,9 +26,9 @@ from gsmap.utils.shards import ShardFile
 RESULTS_KEY = "results"
 GROUND_TRUTH_KEY = "GTs"
 BEZIER = "bezier"
-"""Key of a curve with ``degree`` and ``pts`` in place of points; `compact_results` writes it."""
+"""Key of a Bezier curve, ``degree`` and ``pts``, that replaces points (`compact_results`)."""
 THREE_D = "3D"
-"""Key of the number of samples with heights, among the numbers of ignored elements."""
+"""Key of the number of samples with heights in `SampleFile.ignored`."""
 SHARD_KIND = "results"
 _LAST_LINE = "]}\n"
 _GAUSSIAN_FIELDS = ("scales", "rotations")
@@ -63,19 +63,19 @@ def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, 
 
 
 class SampleFile:
-    """Iterable of the samples of a result or ground-truth file, which are read one by one.
+    """Result or ground-truth file whose samples are read one by one by iteration.
 
     Args:
         path: Path of the file.
         key: Key of the samples: ``results`` or ``GTs``.
         classes: Names of the classes; elements of other classes get the label -1, which no metric
             counts.
-        gaussians: Whether to read the Gaussians of results where all elements have them.
+        gaussians: Whether to read the Gaussians of a sample if all of its elements have them.
 
     Attributes:
         ignored: Number of elements of each other class, and number of samples with heights
-            (``THREE_D``), in the samples so far.
-        about: Metadata of the file, after the last sample. It is not validated.
+            (``THREE_D``), in the samples read so far.
+        about: Metadata of the file. It is set after the last sample was read, and not validated.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class SampleFile:
         return [token for token, _, _ in file]
 
     def load(self, token: str, place: Place) -> MapElements:
-        """Read the elements of one sample at random access.
+        """Read the elements of one sample without reading the samples before it.
 
         Args:
             token: Name of the sample.
@@ -129,7 +129,8 @@ class SampleFile:
             ValueError: If the sample is not in this place.
         """
         start, length = place
-        # If the file was changed, there may be no JSON of a sample in this place: a ValueError.
+        # If the file was changed, this place may not contain the JSON of a sample. The resulting
+        # ValueError is suppressed, and the error below is raised.
         with self.path.open("rb") as file, suppress(ValueError):
             file.seek(start)
             item = json.loads(file.read(length))
@@ -177,7 +178,7 @@ def read_vectors(
         ignored: Number of elements of each other class, and of samples with heights; updated in
             place.
         scored: Whether each element must have a confidence.
-        gaussians: Whether to read the Gaussians where all elements have them.
+        gaussians: Whether to read the Gaussians if all elements have them.
 
     Raises:
         KeyError: If an entry is missing.
@@ -230,13 +231,14 @@ def _check_lengths(elements: MapElements) -> None:
     points = elements.points
     if not len(points):
         return
-    # Fast check: no two points are farther apart than the diagonal of the box of all points. The
-    # product of this diagonal and the number of points is a bound on the length of all lines.
+    # Fast check: all points lie in a cube around the origin, so no two points are farther apart
+    # than its diagonal. All lines together are at most as long as the diagonal times the number of
+    # points.
     max_coordinate = np.abs(points).max()
     max_step = 2 * float(max_coordinate) * points.shape[1] ** 0.5
     if max_step * len(points) <= MAX_LENGTH_M:
         return
-    # A step leads to a vertex from the one before it. Its length is 0 for the first of a line.
+    # Distance of each vertex from the vertex before it; 0 for the first vertex of a line.
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
     first_vertices = starts[starts < len(steps)]  # lines without vertices may be at the end
@@ -260,7 +262,7 @@ def _check_lengths(elements: MapElements) -> None:
 def _points_of(vector: Mapping[str, Any]) -> Any:
     """Return the points of a vector, or points on its Bezier curve."""
     if "pts" in vector or BEZIER not in vector:
-        return vector["pts"]
+        return vector["pts"]  # KeyError if the vector has neither
     curve = vector[BEZIER]
     if not isinstance(curve["degree"], int):
         raise TypeError(f"the degree {curve['degree']!r:.20} is no whole number")
@@ -298,10 +300,10 @@ def read_samples(
         path: Path of the file.
         key: Key of the samples: ``results`` or ``GTs``.
         classes: Names of the classes; elements of other classes get the label -1.
-        gaussians: Whether to read the Gaussians of results where all elements have them.
+        gaussians: Whether to read the Gaussians of a sample if all of its elements have them.
 
     Returns:
-        Elements of each sample by token, and the number of ignored elements of each other class.
+        Elements of each sample by token, and the numbers in `SampleFile.ignored`.
     """
     file = SampleFile(path, key=key, classes=classes, gaussians=gaussians)
     samples = {token: elements for token, elements, _ in file}
@@ -343,7 +345,8 @@ def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
         Number of samples.
 
     Raises:
-        ValueError: If the metadata of the shards differs, or a sample occurs twice.
+        ValueError: If the metadata of the shards differs, a sample occurs twice, or the samples of
+            a shard are not in the order of their tokens.
     """
     with ExitStack() as stack, atomic_write(path) as out:
         files = []
@@ -357,7 +360,8 @@ def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
         out.write(head.removesuffix("\n"))
         count = 0
         last = None
-        for token, line in heapq.merge(*map(_lines_by_token, files)):
+        sorted_lines = [_lines_by_token(file) for file in files]  # each in the order of tokens
+        for token, line in heapq.merge(*sorted_lines):
             if last is not None and token <= last:
                 raise InputError(f"shards of {path} hold sample {token!r} twice or out of order.")
             out.write(",\n" if count else "\n")

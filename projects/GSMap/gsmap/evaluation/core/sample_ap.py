@@ -1,14 +1,15 @@
-"""AP per sample of older methods: lines are drawn to masks, and AP is averaged over samples.
+"""AP per sample, a metric of older methods: lines are compared as masks, and AP is averaged.
 
-Rules, equal to the public evaluation code of the methods that use this metric:
+The rules equal the public evaluation code of the methods that use this metric:
 
-- The lines of a class in a sample are drawn to one mask of 0.15 m pixels in the order of the file,
-  so that a later line hides the pixels that it crosses.
-- The distance of two lines is the mean of both directed mean distances from the pixels of one line
-  to the nearest pixel of the other.
-- The closest pair below the threshold matches first, whatever its score.
+- The lines of a class in a sample are drawn to one mask with pixels of 0.15 m, in the order of the
+  file. A later line hides the pixels of earlier lines that it crosses.
+- The directed distance from one line to another is the mean distance from the pixels of the first
+  line to the nearest pixel of the second one. The distance of two lines is the mean of both
+  directed distances.
+- The closest pair below the threshold is matched first, regardless of its score.
 - Predictions count in the order of *rising* score, and precision is taken at ten recalls.
-- A sample that has neither predictions nor ground truth of a class is left out for the class.
+- A sample with neither predictions nor ground truth of a class is left out for this class.
 """
 
 from collections.abc import Mapping
@@ -35,15 +36,15 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
 PIXEL_M = 0.15
-_FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
-_NO_PIXEL = 1e6  # distance where a column has no pixel of the line: larger than any canvas
+_FAR_PX = 2.0**20  # coordinates are clipped to this limit, as OpenCV draws with integers
+_NO_PIXEL = 1e6  # distance in a column without pixels of the line, larger than any canvas
 MaskArray = npt.NDArray[np.int32]
-GapArray = npt.NDArray[np.float32]
+GapArray = npt.NDArray[np.float32]  # distances within the columns of a mask, in pixels
 
 
 @dataclass(frozen=True)
 class SampleAP(Metric):
-    """AP per sample; the metric of each method is a subclass in ``models/<method>/metric.py``.
+    """Base class of AP per sample. Each method has a subclass in ``models/<method>/metric.py``.
 
     Attributes:
         ranks: Whether the metric ranks predictions over all samples.
@@ -54,8 +55,8 @@ class SampleAP(Metric):
     Args:
         classes: Names of the classes; a label is an index into them.
         grid: Extent of the canvas in metres; its raster is not used.
-        min_score: Smallest score of a prediction that counts, in [0, 1]. The public code of the
-            methods counts all predictions.
+        min_score: Smallest score of a prediction that counts, in [0, 1]. With the default, all
+            predictions count, as in the public code of the methods.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -109,10 +110,9 @@ class SampleAP(Metric):
 
 
 def draw_numbers(elements: MapElements, label: int, config: SampleAP) -> MaskArray:
-    """Draw the lines of a class to one mask of element indices; later lines hide earlier ones.
+    """Draw the lines of a class to one mask of element indices. Later lines hide earlier ones.
 
-    Coordinates are truncated to whole pixels toward zero, counted from the corner of smallest x
-    and y.
+    Pixel (0, 0) is at the corner of smallest x and y. Coordinates are truncated toward zero.
 
     Args:
         elements: Elements in metres; elements of fewer than two points are not drawn.
@@ -140,11 +140,11 @@ def draw_numbers(elements: MapElements, label: int, config: SampleAP) -> MaskArr
 
 @dataclass(frozen=True)
 class _MaskPixels:
-    """Pixels of a mask of elements. The n elements with a pixel are numbered from 0 to n - 1.
+    """Pixels of a mask of elements. The n elements that have a pixel get the numbers 0 to n - 1.
 
     Args:
         mask: Number of the element at each pixel, or -1. (H, W)
-        indices: Index in the sample of the element of each number. (n,)
+        indices: Index in the sample of each numbered element. (n,)
         rows: Row of each pixel. (M,)
         columns: Column of each pixel. (M,)
         owners: Number of the element of each pixel, ascending. (M,)
@@ -196,7 +196,7 @@ def _fill_gaps(gaps: GapArray, mask: MaskArray, number: int) -> None:
         number: Number of the element.
     """
     height, width = mask.shape
-    gaps[0] = _NO_PIXEL  # the first row has no row above: it reads this value
+    gaps[0] = _NO_PIXEL  # read in the loop by the first row, which has no row above
     for r in range(height):  # distance from the nearest pixel above
         above = gaps[max(r - 1, 0)]
         for c in range(width):
@@ -208,15 +208,15 @@ def _fill_gaps(gaps: GapArray, mask: MaskArray, number: int) -> None:
 
 @njit(cache=True)
 def _distance_from_gaps(gaps: GapArray, column: int) -> float:
-    """Compute the distance in pixels to the nearest pixel of an element.
+    """Compute the distance in pixels from a pixel to the nearest pixel of an element.
 
     Args:
-        gaps: Distances within each column, at the row of the pixel. (W,)
+        gaps: Distances from `_fill_gaps` in the row of the pixel. (W,)
         column: Column of the pixel.
     """
     best_sq = gaps[column] ** 2
-    # Pixels in the columns `step` aside are at least `step` away, so the search ends when `step`
-    # reaches the smallest distance so far.
+    # Pixels that are `step` columns away have at least the distance `step`, so the search ends when
+    # `step` reaches the smallest distance so far.
     step = 1
     while step * step < best_sq and step < len(gaps):
         if column >= step:
@@ -234,11 +234,11 @@ def _mean_distances(
     """Compute the mean distance from the pixels of m other elements to each of N elements.
 
     Args:
-        mask: Number of the element at each pixel, of N elements, or -1. (H, W)
-        is_near: Which pairs of one of the N elements and one of the m others to measure. (N, m)
+        mask: Number (below N) of the element at each pixel, or -1. (H, W)
+        is_near: Whether to measure each pair of one of the N and one of the m elements. (N, m)
         rows: Row of each pixel of the other elements. (M,)
         columns: Column of each pixel of the other elements. (M,)
-        owners: Number, below m, of the other element of each pixel. (M,)
+        owners: Number (below m) of the other element of each pixel. (M,)
 
     Returns:
         Mean distances in pixels, infinite where they are not measured. (N, m)
@@ -260,7 +260,7 @@ def _mean_distances(
 
 
 def _squared_gaps(first: _MaskPixels, second: _MaskPixels, axis: str) -> FloatArray:
-    """Compute the squared gap in pixels between every two elements along one axis. (n, k)"""
+    """Compute squared gaps in pixels between the bounds of elements along an axis. (n, k)"""
     first_low, first_high = first.bounds(getattr(first, axis))
     second_low, second_high = second.bounds(getattr(second, axis))
     gaps = np.maximum(second_low - first_high[:, None], first_low[:, None] - second_high)
@@ -271,12 +271,12 @@ def _squared_gaps(first: _MaskPixels, second: _MaskPixels, axis: str) -> FloatAr
 def line_distances(
     pred_mask: MaskArray, gt_mask: MaskArray, limit_m: float = np.inf
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Compute the distance of every prediction from every ground truth that has a pixel.
+    """Compute the distance of each prediction from each ground truth, for elements with a pixel.
 
     Args:
         pred_mask: Index of the prediction at each pixel, or -1. (H, W)
         gt_mask: Index of the ground truth at each pixel, or -1. (H, W)
-        limit_m: Limit in metres; pairs that cannot be closer are not measured.
+        limit_m: Limit in metres. Pairs that cannot be closer than this are not measured.
 
     Returns:
         Distances in metres, infinite where they are not measured (n, k); indices of the predictions
@@ -291,7 +291,7 @@ def line_distances(
     from_pred = _mean_distances(
         gt.mask, is_near=is_near, rows=pred.rows, columns=pred.columns, owners=pred.owners
     ).T  # (n, k)
-    # The distance is the mean of both directions, so it is at least half of the first one.
+    # The distance is the mean of both directions, so it is at least half of one direction.
     is_near = from_pred * PIXEL_M / 2 < limit_m
     from_gt = _mean_distances(
         pred.mask, is_near=is_near, rows=gt.rows, columns=gt.columns, owners=gt.owners
@@ -304,7 +304,7 @@ def closest_pairs(distance_m: FloatArray, limit_m: float) -> IntArray:
 
     Args:
         distance_m: Distance of every pair in metres. (n, k)
-        limit_m: Distance in metres that pairs must be below.
+        limit_m: Limit in metres. Only pairs with a smaller distance are matched.
 
     Returns:
         Column of each row, or -1. (n,)
@@ -326,7 +326,7 @@ def match_sample_ap(
 ) -> FrameMatches:
     """Match the predictions of one sample with its ground truth by the distance of their masks.
 
-    Elements of either side without a visible pixel do not count.
+    Predictions and ground truths without a visible pixel do not count.
 
     Args:
         predictions: Elements with scores.
@@ -374,8 +374,8 @@ def match_sample_ap(
 def sample_aps(detections: ClassDetections) -> FloatArray:
     """Compute the AP of a class in each sample.
 
-    Predictions count in the order of rising score, as in the public code; matches come first among
-    equal scores.
+    Predictions count in the order of rising score, as in the public code. Among equal scores,
+    matched predictions come first.
 
     Args:
         detections: Predictions of the class in all samples.
@@ -404,7 +404,7 @@ def sample_aps(detections: ClassDetections) -> FloatArray:
 
 
 def _mean(values: FloatArray) -> float:
-    """Compute the mean of the values that are defined."""
+    """Compute the mean of the values that are not NaN; `UNDEFINED` if there are none."""
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if len(defined) else UNDEFINED
 
@@ -436,8 +436,8 @@ def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricRepor
             # Whether the AP of a sample is defined does not depend on the threshold.
             num_samples = (~np.isnan(class_aps[:, 0])).sum()
             metrics[f"{class_name}/num_samples"] = float(num_samples)
-            # An undefined mean is UNDEFINED in the reports. Here it becomes NaN, which `_mean`
-            # below leaves out.
+            # An undefined mean is reported as UNDEFINED. Here it becomes NaN, so that `_mean` below
+            # leaves it out.
             means[row] = np.where(np.equal(class_means, UNDEFINED), np.nan, class_means)
             detections[class_name] = ranked
             aps[class_name] = class_aps

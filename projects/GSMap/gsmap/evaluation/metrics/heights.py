@@ -23,9 +23,10 @@ from gsmap.structures.polylines import resample_all
 @register_metric
 @dataclass(frozen=True)
 class Heights(Metric):
-    """Errors of the heights of predictions that match in the plane, at the loosest threshold.
+    """Errors of the heights of predictions that match in the plane, at the largest threshold.
 
-    Each point of a prediction is compared with the nearest point of its ground truth in the plane.
+    The height of each point of a prediction is compared with the height of the point of its ground
+    truth that is nearest in the plane.
 
     Args:
         classes: Names of the classes; a label is an index into them.
@@ -66,9 +67,10 @@ class Heights(Metric):
         matches = match_chamfer(predictions, truth, config=rules, token=token)
         pred_lines = self._resample(predictions)
         gt_lines = self._resample(truth)
-        matched_gt = matches.matched_gt[:, -1]  # at the loosest threshold; -1 without a match
+        matched_gt = matches.matched_gt[:, -1]  # at the largest threshold; -1 without a match
         rows = np.flatnonzero(matched_gt >= 0)
-        errors = np.empty((len(rows), 2, self.num_points))  # height, distance in the plane
+        # The second axis has two entries: difference of heights, and distance in the plane.
+        errors = np.empty((len(rows), 2, self.num_points))
         for index, row in enumerate(rows.tolist()):
             pred = pred_lines[matches.pred_index[row]]
             gt = gt_lines[matched_gt[row]]

@@ -1,4 +1,4 @@
-"""SOSPA, a distance of lines that respects the order of points, and PLD, a distance of maps.
+"""SOSPA, a distance of lines that depends on the order of points, and PLD, a distance of maps.
 
 Lehocine et al., "Beyond Chamfer Distance", arXiv 2605.22578. The evaluator of the paper
 (zenseact/SOSPA) computes equal figures. Both distances are in [0, 1], and smaller is better.
@@ -37,20 +37,20 @@ _PARTS = ("PLD", "localisation", "cardinality")
 def sample_line(line: FloatArray) -> FloatArray:
     """Sample a line at every half metre and at its end.
 
-    The step of a line of more than a kilometre is longer, so that the line has 2,001 points.
+    A line of more than a kilometre is sampled with a longer step, such that it has 2,001 points.
 
     Args:
         line: Vertices in metres. (n, D)
 
     Returns:
-        Points in metres; none for a single vertex. (m, D)
+        Points in metres; empty for a line of a single vertex. (m, D)
     """
     if len(line) < 2:
         return line[:0]
     along = arc_lengths(line)
     length_m = along[-1]
     step_m = max(_STEP_M, length_m / _MOST_STEPS)
-    stop = max(length_m, np.finfo(float).tiny)  # > 0, so that a line of length 0 has its start
+    stop = max(length_m, np.finfo(float).tiny)  # > 0, so that a line of length 0 keeps its start
     positions = np.append(np.arange(0.0, stop, step=step_m), length_m)
     return np.stack([np.interp(positions, along, column) for column in line.T], axis=-1)
 
@@ -64,11 +64,11 @@ def _align_points(distances: FloatArray, gap_cost: float) -> tuple[float, float]
         gap_cost: Cost of a point without partner, in metres.
 
     Returns:
-        Total cost, and the sum of the distances of the pairs, which is a part of it.
+        Total cost, and the part of it that is the sum of the distances of the pairs.
     """
-    # cost[j] is the smallest cost of pairing the rows so far with the first j columns, and
-    # paired[j] the distances in it. A row overwrites both from left to right; the values of the
-    # row before at column j are kept as `diagonal_cost` and `diagonal_paired`.
+    # cost[j] is the smallest cost of pairing the rows so far with the first j columns. paired[j] is
+    # the sum of the distances of the pairs in this cost. Each row overwrites both arrays from left
+    # to right. `diagonal_cost` and `diagonal_paired` are the previous row's values at column j.
     num_columns = distances.shape[1] + 1
     cost = gap_cost * np.arange(num_columns)
     paired = np.zeros(num_columns)
@@ -94,7 +94,7 @@ def _align_points(distances: FloatArray, gap_cost: float) -> tuple[float, float]
 
 @njit(cache=True)
 def _align_lines(distances: FloatArray, gap_cost: float, num_starts: int) -> tuple[float, float]:
-    """Return `_align_points` for the best start and direction of the first line.
+    """Return the result of `_align_points` for the best start and direction of the first line.
 
     Args:
         distances: Distance of every pair of points in metres. (m, n)
@@ -116,12 +116,12 @@ def _align_lines(distances: FloatArray, gap_cost: float, num_starts: int) -> tup
 def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> FloatArray:
     """Compute the SOSPA distance of two lines, and its localisation part.
 
-    Points are paired in order. A pair costs its distance, a point without partner costs c / 2. C is
-    the smallest sum of costs, over both directions of the first line and, if one of the lines is
-    closed (ends within 0.1 m), over all starts of the first line. G = c / 2 (m + n) is the sum of
-    costs without any pair. The distance is 2 C / (G + C): 0 for equal lines, 1 for lines without
-    points within c of each other. The localisation part has the distances of the pairs in place of
-    the C above the fraction bar.
+    Points are paired in order. A pair costs its distance. A point without partner costs c / 2. C is
+    the smallest sum of costs, over both directions of the first line. If one of the lines is closed
+    (ends within 0.1 m), C is the smallest sum over all starts of the first line as well. The sum of
+    costs without any pair is G = c / 2 (m + n). The distance is 2 C / (G + C). It is 0 for equal
+    lines, and 1 for lines without points within c of each other. The localisation part is
+    2 D / (G + C), where D is the sum of the distances of the pairs.
 
     Args:
         first: Points at equal distances (`sample_line`), in metres. (m, D)
@@ -162,7 +162,7 @@ def _pair_sums(
     gts: Sequence[FloatArray],
     cutoffs_m: Sequence[float],
 ) -> FloatArray:
-    """Sum r (1 - s), and r times the localisation part, over the best pairs of one class.
+    """Sum r (1 - s), and r times the localisation part of s, over the best pairs of one class.
 
     A pair of score r and SOSPA distance s costs r s + (1 - r) / 2 (`PLD`). Without partners, its
     two elements would cost r / 2 and 1 / 2. The difference, r (1 - s), is the gain of the pair.
@@ -196,10 +196,10 @@ class PLD(Metric):
     """PLD, the distance of predicted maps with scores from annotated maps.
 
     In each sample and class, predictions of score r are paired with ground truths at the smallest
-    cost: r s + (1 - r) / 2 for a pair with SOSPA s, r / 2 for a prediction without partner, 1 / 2
-    for a ground truth without partner. Like SOSPA, the sum D over all samples is normalised to
-    2 D / (M + D), with M = (sum of scores + number of ground truths) / 2, the sum without pairs.
-    Lines are compared in the plane.
+    cost. A pair with SOSPA s costs r s + (1 - r) / 2, a prediction without partner r / 2, and a
+    ground truth without partner 1 / 2. D is the sum of the costs over all samples. PLD is
+    2 D / (M + D), where M = (sum of scores + number of ground truths) / 2 is the sum of the costs
+    without any pair. Lines are compared in the plane.
 
     Args:
         classes: Names of the classes; a label is an index into them.
@@ -256,11 +256,12 @@ class PLD(Metric):
     def reports(self, table: ValueTable) -> list[MetricReport]:
         """Compute PLD from the sums of all samples.
 
-        The keys of figures are ``CLASS/PLD@CUTOFF``. Keys with ``localisation`` in place of ``PLD``
-        are the part of PLD due to the distances of paired points. ``cardinality`` is the rest: it
-        is due to points and lines without partners, and to scores below 1. Figures without cut-off
-        are means over the cut-offs; figures without class are means over the classes. A class that
-        occurs in no sample has 0.
+        The keys of the figures are ``CLASS/PLD@CUTOFF``, ``CLASS/localisation@CUTOFF`` and
+        ``CLASS/cardinality@CUTOFF``. ``localisation`` is the part of PLD due to the distances of
+        paired points. ``cardinality`` is the rest, which is due to points and lines without
+        partners and to scores below 1. Figures without cut-off are means over the cut-offs. Figures
+        without class are means over the classes. The figures of a class that occurs in no sample
+        are 0.
 
         Args:
             table: Values of all samples.

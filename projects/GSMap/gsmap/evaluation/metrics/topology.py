@@ -22,8 +22,8 @@ from gsmap.structures.polylines import arc_lengths, resample
 from gsmap.utils.errors import InputError
 
 _POINTS = 128  # points of an element, at equal distances
-_FOLD_CHORD_M = 2.0  # length of the chords before and after a fold
 _COUNTS = ("breaks", "false_joints", "folds", "num_gts", "num_preds")
+_FOLD_CHORD_M = 2.0  # length of the chords before and after a fold
 _FOLD_COS = -0.5  # cosine of 120 degrees, the smallest angle between both chords at a fold
 
 
@@ -37,8 +37,8 @@ class Topology(Metric):
         area_labels: Labels of classes whose elements enclose an area.
         min_score: Smallest score of a prediction that counts, in [0, 1].
         tolerance_m: Largest distance in metres at which a line covers a point of another line.
-        min_piece_m: Length in metres of the shortest piece that counts, > 2 ``tolerance_m``, so
-            that a line that crosses another does not cover a piece of it.
+        min_piece_m: Length in metres of the shortest piece that counts, > 2 ``tolerance_m``. So a
+            line that crosses another line does not cover a piece of it.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -140,7 +140,7 @@ def _count_excess_pieces(
 ) -> int:
     """Count the excess pieces of elements.
 
-    An element of which different lines cover n pieces has n - 1 excess pieces.
+    If different lines cover n pieces of an element, it has n - 1 excess pieces.
     """
     if not lines:
         return 0
@@ -177,13 +177,13 @@ def count_folds(line: FloatArray, is_area: bool) -> int:
     length = arc_lengths(line)[-1]
     if not 2 * _FOLD_CHORD_M <= length < np.inf:
         return 0
-    span = max(round(_FOLD_CHORD_M / length * (_POINTS - 1)), 1)  # points per chord
+    span = max(round(_FOLD_CHORD_M / length * (_POINTS - 1)), 1)  # steps between points per chord
     chords = points[span:] - points[:-span]
     before = chords[:-span]  # each one ends where the chord of equal index in `after` starts
     after = chords[span:]
     lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
     is_fold = (before * after).sum(axis=1) < _FOLD_COS * lengths
-    # Successive points with a fold count once, at the first of them.
+    # A fold at several successive points counts once, at the first of them.
     starts_fold = is_fold[1:] & ~is_fold[:-1]
     return int(is_fold[:1].sum() + starts_fold.sum())
 

@@ -62,7 +62,7 @@ def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights
 def place_samples(
     offsets: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None = None
 ) -> Tensor:
-    """Sampling locations around reference points.
+    """Compute sampling locations around reference points.
 
     Args:
         offsets: Offsets (x, y) from the reference point, in cells. (B, Q, heads, S, 2)
@@ -177,8 +177,9 @@ class BEVDeformableAttention(SamplingAttention):
         tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
         locations = self.locations(query, reference, shape=shape, frames=frames)
         weights = self.weights(query)
-        # Projection and sampling commute. Projecting last is faster if the heads read fewer cells
-        # than they would otherwise project, unless a fused kernel samples.
+        # Projection and sampling are linear, so either may come first. Sampling first is faster if
+        # the heads read fewer cells than the projection of the whole map computes. With a fused
+        # kernel, projection always comes first.
         num_cells_read = weights.numel() * _CORNERS
         num_cells_projected = tokens[..., 0].numel() * self.num_heads
         is_fused = has_kernel(tokens) or has_compiled_op(tokens)
@@ -192,7 +193,7 @@ class BEVDeformableAttention(SamplingAttention):
     def locations(
         self, query: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None
     ) -> Tensor:
-        """Sampling locations of each query.
+        """Compute the sampling locations of each query.
 
         Args:
             query: Queries with their positional encoding. (B, Q, C)
@@ -212,12 +213,13 @@ class BEVDeformableAttention(SamplingAttention):
         """Sample the unprojected map, then project the sample of each head. (B, Q, C)"""
         cells, cell_weights = bilinear_cells(locations, weights, shape)
         batch_index = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
-        # `table` has the cells of the first map of the batch, then of the second one, and so on.
+        # Rows of `table`: the cells of the batch's first map, then of the second one, and so on.
         table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])  # (B * H * W, C)
         rows = batch_index * tokens.shape[1] + cells
         sampled = sum_rows(table, rows, cell_weights)
-        # If each cell were projected first, the weighted sum would have the bias times the sum of
-        # the weights. This sum is less than 1 if a sample lies at the border of the map.
+        # If each cell were projected first, its bias would be part of the weighted sum. So the bias
+        # is multiplied by the sum of the weights. This sum is less than 1 if a sample lies at the
+        # border of the map.
         weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C / heads, C)
         bias = self.value_proj.bias.view(self.num_heads, -1)
         projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)
@@ -250,7 +252,7 @@ class MultiLevelAttention(SamplingAttention):
         Args:
             query: Queries with their positional encoding. (B, Q, C)
             reference: References, as in `place_samples`. (B, Q, D)
-            feats: Feature maps. The offsets of a map are in cells of this map. (B, C, h, w) each
+            feats: Feature maps. Offsets in a map are in cells of this map. (B, C, h, w) each
             frames: Matrices of the offsets, as in `place_samples`, or None. (B, Q, 2, 2)
 
         Returns:
@@ -268,11 +270,11 @@ class MultiLevelAttention(SamplingAttention):
 
 
 def directional_offsets(num_heads: int, num_points: int) -> Tensor:
-    """Offsets on a square around the origin, in a direction for each head.
+    """Create offsets on squares around the origin, with a different direction for each head.
 
     Args:
         num_heads: Number of heads.
-        num_points: Samples S per head. Sample s has s + 1 times the offset of the first one.
+        num_points: Samples S per head. The offset of sample s is s + 1 times the first offset.
 
     Returns:
         Offsets (x, y) in cells. (heads, S, 2)

@@ -62,7 +62,7 @@ class DistanceQuality(Quality):
 
 @MODELS.register_module()
 class QualityClassLoss(ClassLoss):
-    r"""Quality focal loss from the second decoder layer on, a plain loss for the first (DAMap).
+    r"""Quality focal loss for all decoder layers but the first, which has a plain loss (DAMap).
 
     With score s and quality q, the loss of the class of a matched ground truth is
     :math:`|q - s|^\beta \mathrm{BCE}(s, q)`, and of every other class and query
@@ -74,8 +74,8 @@ class QualityClassLoss(ClassLoss):
         first_layer: Config of the loss of the first layer, on logits and one-hot targets.
         beta: Exponent of the distance between score and target.
         loss_weight: Weight of the loss.
-        classes: Indices of the classes with the quality as target. Matched ground truths of other
-            classes have the target 1. None means all classes.
+        classes: Indices of the classes whose target is the quality. The target of other classes is
+            1 for matched pairs. None means all classes.
 
     Raises:
         ValueError: If the head lacks a class or an input of the quality.
@@ -109,7 +109,8 @@ class QualityClassLoss(ClassLoss):
         """
         scores = pairs.predictions.scores
         targets = self.targets(pairs)
-        num_queries = scores.shape[1] // pairs.num_layers  # in a layer; the first layer comes first
+        # The queries of all layers are concatenated, beginning with the first layer.
+        num_queries = scores.shape[1] // pairs.num_layers
         first_labels = pairs.query_labels()[:, :num_queries]
         first_losses = plain_class_loss(
             self.first_layer, scores=scores[:, :num_queries], labels=first_labels
@@ -137,7 +138,7 @@ class QualityClassLoss(ClassLoss):
 
 
 def plain_class_loss(loss: Any, scores: Tensor, labels: Tensor) -> Tensor:
-    """Values of a classification loss of mmdet.
+    """Compute a classification loss of mmdet without reduction.
 
     Args:
         loss: Loss module with logits and one-hot targets as inputs.
@@ -147,8 +148,8 @@ def plain_class_loss(loss: Any, scores: Tensor, labels: Tensor) -> Tensor:
     Returns:
         Weighted loss of every logit. (B, N, classes)
     """
-    # With one-hot targets, mmdet's focal loss does not need its compiled op. Column 0 is of queries
-    # without a class, label -1, and is cut off.
+    # With one-hot targets, mmdet's focal loss does not need its compiled op. Column 0 marks queries
+    # without a class (label -1) and is removed.
     one_hot = F.one_hot(labels + 1, scores.shape[-1] + 1)[..., 1:]
     values = loss(scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none")
     return values.view_as(scores)

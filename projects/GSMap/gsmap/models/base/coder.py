@@ -36,14 +36,17 @@ class Detections(NamedTuple):
 
 
 class MapCoder:
-    """Coder of detections: the pairs of query and class with the highest scores, near the map.
+    """Selects detections: the pairs of query and class with the highest scores.
+
+    Detections with points far outside of the map are dropped.
 
     Args:
         grid: Extent of the map.
         max_num: Largest number of detections per sample, >= 1.
-        margin_m: Largest distance of a point beyond the map, in metres, > 0. None keeps all
+        margin_m: Largest distance of a point outside of the map, in metres, > 0. None keeps all
             detections.
-        score_threshold: Detections need a higher score. None keeps all detections.
+        score_threshold: Detections with this score or a lower one are dropped. None keeps all
+            detections.
         unfold_classes: Class indices of lines whose points are reordered to a short path
             (`shortest_orders`). This is for models that are trained with losses of masks, which do
             not penalise lines that run back and forth.
@@ -118,7 +121,7 @@ class MapCoder:
         return scores
 
     def best(self, scores: Tensor) -> Detections:
-        """Pairs of query and class with the highest scores, at any place.
+        """Pairs of query and class with the highest scores, without a check of their positions.
 
         Args:
             scores: Class logits. (N, classes)
@@ -158,7 +161,7 @@ class MapCoder:
 
 
 class DetectionHead(BaseModule, NeedsTargets):
-    """Base class of heads: detections of the last decoder layer.
+    """Base class of map heads, which predict the detections of the last decoder layer.
 
     Attributes:
         reference: Decoding of references to points.
@@ -203,7 +206,8 @@ class DetectionHead(BaseModule, NeedsTargets):
             fields = self.reference.decode(references)
             scores = self.coder.weigh_scores(scores, fields)
             best = self.coder.decode(scores, fields["pts"])
-            detections = self.coder.unfold_lines(self.select_detections(fields, best), best.labels)
+            best_fields = self.select_detections(fields, best)
+            detections = self.coder.unfold_lines(best_fields, best.labels)
             detections["scores_3d"] = best.scores
             detections["labels_3d"] = best.labels
             metainfo = dict(self.reference.metainfo)
@@ -211,7 +215,7 @@ class DetectionHead(BaseModule, NeedsTargets):
         return results
 
     def select_detections(self, fields: Tensors, best: Detections) -> Tensors:
-        """Fields of the detections.
+        """Select the fields of the detections.
 
         Args:
             fields: Decoded references, by name. (N, ...) each

@@ -1,7 +1,7 @@
 """Decoder of map elements: layers with attention among queries and to the BEV features.
 
-A reference is the geometry of a point that a query predicts and that each layer refines: D numbers,
-which are the coordinates of the point or also the entries of a Gaussian.
+A reference is the geometry of a predicted point, which each layer refines. It has D numbers: the
+coordinates of the point and, if points are Gaussians, also the parameters of the Gaussian.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,8 @@ from gsmap.models.base.parts import build_part
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.utils.settings import check_positive
 
-Refine = Callable[[int, Tensor, Tensor], Tensor]  # (layer, point states, reference) -> reference
+Refine = Callable[[int, Tensor, Tensor], Tensor]
+"""Function (index of a layer, point states, references) -> refined references."""
 
 
 class Guidance(nn.Module):
@@ -37,14 +38,15 @@ class Guidance(nn.Module):
         raise NotImplementedError
 
     def frames(self, reference: Tensor, feats: Tensor) -> Tensor | None:
-        """Matrices for the sampling offsets of each query.
+        """Matrices that transform the sampling offsets of each query.
 
         Args:
             reference: References. (B, Q, D)
-            feats: Sampled feature map, or maps.
+            feats: Feature map that is sampled, or several maps.
 
         Returns:
-            Matrices that multiply offsets in cells from the left, or None. (B, Q, 2, 2)
+            Matrices that multiply the offsets, column vectors in cells, from the left. None leaves
+            the offsets unchanged. (B, Q, 2, 2)
         """
         raise NotImplementedError
 
@@ -81,7 +83,7 @@ class Decoded:
     instance_states: Tensor
 
     def of_queries(self, queries: slice) -> "Decoded":
-        """Output for some of the instance queries."""
+        """Select the output of some of the instance queries."""
         fields = {name: values[:, queries] for name, values in vars(self).items()}
         return type(self)(**fields)
 
@@ -195,7 +197,7 @@ class MapDecoder(BaseModule):
         point_queries: True if the queries are of points (B, N * P, C), False if they are of
             instances (B, N, C).
         layer_class: Class of the layers if their config has no type.
-        branches: Index of the prediction branches of each output.
+        branches: For each output, the index of the prediction branches that are applied to it.
     """
 
     point_queries = True
@@ -221,7 +223,7 @@ class MapDecoder(BaseModule):
     def reference_settings(cls, num_points: int) -> dict[str, Any]:
         """Settings of the reference that depend on the decoder. This class has none.
 
-        A decoder in which the state of an instance refines all P points passes P, for example.
+        For example, a decoder in which one instance state refines all P points returns P.
 
         Args:
             num_points: Points per instance P.
@@ -229,7 +231,7 @@ class MapDecoder(BaseModule):
         return {}
 
     def start(self, query: Tensor, reference: Tensor, bev_feats: Tensor) -> tuple[Any, Tensor, Any]:
-        """Inputs of the first layer.
+        """Convert the inputs of the decoder to the types that its layers exchange.
 
         Args:
             query: Content of the queries. (B, Q, C)
@@ -237,16 +239,16 @@ class MapDecoder(BaseModule):
             bev_feats: BEV features. (B, C, H, W)
 
         Returns:
-            States, references and features, in the types that the layers need.
+            States, references and features for the first layer.
         """
         return query, reference, bev_feats
 
     def point_states(self, state: Any) -> Tensor:
-        """States of the points, from the states of a layer. (B, N * P, C)"""
+        """Extract the states of the points from the states of a layer. (B, N * P, C)"""
         return state
 
     def read(self, state: Any, references: Tensor) -> Decoded:
-        """Output of a layer.
+        """Create the output of a layer.
 
         Args:
             state: States after the layer.

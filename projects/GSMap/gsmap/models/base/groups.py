@@ -13,7 +13,8 @@ class QueryGroup:
 
     Args:
         num: Number of instance queries, >= 1.
-        name: Suffix of the names of its losses. The group that predicts has the empty name.
+        name: Suffix of the names of its losses. It is empty for the group whose queries give the
+            predictions of the model.
         repeats: Number of queries that each ground truth is matched to, >= 1.
         weight: Weight of its losses.
         losses: Names of its losses. None means all losses of the head.

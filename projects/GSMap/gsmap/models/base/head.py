@@ -46,10 +46,10 @@ _PRIOR_PROBABILITY = 0.01
 class MapHead(LossHead):
     """Head that predicts N map elements of P ordered points from BEV features.
 
-    Map models are combinations of its parts: decoder, references, losses and others. Point queries
-    are the sums of embeddings of instances and points (MapTR); half of their channels are
-    positional. The decoder refines the queries, and the predictions of its layers are matched with
-    the ground truth for the losses.
+    Map models are combinations of the parts of this head: decoder, references, losses and others.
+    Point queries are the sums of embeddings of instances and points (MapTR); half of their channels
+    are positional. The decoder refines the queries, and the predictions of its layers are matched
+    with the ground truth for the losses.
 
     Args:
         grid: Extent of the map.
@@ -63,8 +63,8 @@ class MapHead(LossHead):
         reference: Config of the references, which the decoder refines. Default: `PointReference`.
         masks: `ElementMasks` or their settings, for losses and costs of masks.
         aux_heads: Configs of auxiliary heads, for training.
-        flow_parts: Configs of modules that make hooks in training, for example with queries from
-            the ground truth (`FlowPart`).
+        flow_parts: Configs of modules (`FlowPart`) that create hooks in training. A hook changes
+            the queries of the decoder, for example by adding queries from the ground truth.
         coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
@@ -101,7 +101,7 @@ class MapHead(LossHead):
         **settings: Any,
     ) -> None:
         super().__init__(init_cfg)
-        # A setting that a map model adds may stand for a config of `point_queries`.
+        # A map model may have added a setting from which the config of `point_queries` follows.
         point_queries = resolve_added_settings(settings).get("point_queries", point_queries)
         self.grid = grid
         self.classes = tuple(classes)
@@ -164,7 +164,7 @@ class MapHead(LossHead):
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Settings of the transform of targets that follow from the settings of the head.
+        """Settings of the targets' transform that follow from the settings of the head.
 
         Args:
             settings: Settings of the head.
@@ -181,7 +181,7 @@ class MapHead(LossHead):
             ValueError: If a setting does not exist.
         """
         kind = self.reference.coder_class or MapCoder
-        valid_names: set[str] = set()  # subclasses pass settings on to the class they derive from
+        valid_names: set[str] = set()  # of all base classes: subclasses pass settings on to them
         for base in kind.__mro__:
             valid_names.update(signature(base).parameters)
         unknown = sorted(set(settings) - valid_names)
@@ -288,7 +288,7 @@ class MapHead(LossHead):
         num_predicting = self.query_groups[0].num
         if loaded is None or loaded.shape == initial.shape:
             return
-        if len(loaded) < num_predicting:  # the state stays as it is, and does not fit the model
+        if len(loaded) < num_predicting:  # too few queries: the state cannot be made to fit
             return
         common = loaded[: len(initial)]
         missing = initial.detach()[len(common) :].to(common)
@@ -308,7 +308,8 @@ class MapHead(LossHead):
 
         Args:
             bev_outputs: Outputs of the BEV encoder, with ``bev_feats`` (B, C, H, W).
-            hooks: Hooks into the flow, for example to add queries from previous frames.
+            hooks: Hooks into the flow of the queries, for example to add queries from previous
+                frames.
 
         Returns:
             The predictions of each layer, with scores in at least float32.
@@ -353,7 +354,7 @@ class MapHead(LossHead):
         return outputs
 
     def predictions(self, scores: Tensor, decoded: Decoded, bev_feats: Tensor) -> Predictions:
-        """Predictions of a layer.
+        """Create the predictions of a layer.
 
         Args:
             scores: Class logits. (B, N, classes)
@@ -375,7 +376,10 @@ class MapHead(LossHead):
         Args:
             bev_outputs: Outputs of the BEV encoder, with ``bev_feats`` (B, C, H, W).
             batch_data_samples: Samples of the batch.
-            hooks: Hooks into the flow.
+            hooks: Hooks into the flow of the queries.
+
+        Returns:
+            The detections of each sample.
         """
         metas = [sample.metainfo for sample in batch_data_samples]
         return self.predict_by_feat(self(bev_outputs, hooks), metas)
@@ -392,7 +396,7 @@ class MapHead(LossHead):
         Args:
             bev_outputs: Outputs of the BEV encoder, with ``bev_feats`` (B, C, H, W).
             batch_data_samples: Samples with ground truth.
-            hooks: Hooks into the flow, called after the hooks of ``flow_parts``.
+            hooks: Hooks into the flow of the queries, called after the hooks of ``flow_parts``.
             layers: Predictions of each layer, if the head has already been run without hooks.
 
         Returns:

@@ -1,6 +1,6 @@
-"""Hooks into the flow of a head, which are its steps from the initial queries to the losses.
+"""Hooks into the flow of a head, the sequence of steps from the initial queries to the losses.
 
-They add queries from previous frames (temporal memory), or queries with known matches (denoising).
+Hooks add queries from previous frames (temporal memory) or queries with known matches (denoising).
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,11 @@ class FlowStart(NamedTuple):
     """Input of the first decoder layer.
 
     Attributes:
-        queries: States, positions and references for `MapDecoder.forward`. States and positions are
-            (B, N * P, C) for a decoder of point queries, and (B, N, C) for a decoder of instance
-            queries. References are (B, N * P, D).
-        mask: True where an instance (row) may not attend to another (column), or None. (N, N)
+        queries: States, positions and references (reference points) for `MapDecoder.forward`.
+            States and positions are (B, N * P, C) for a decoder of point queries, and (B, N, C) for
+            a decoder of instance queries. References are (B, N * P, D).
+        mask: True where an instance (row) may not attend to another instance (column); None if
+            nothing is masked. (N, N)
     """
 
     queries: Queries
@@ -42,13 +43,13 @@ class FlowHead(BuiltHead, Protocol):
         truths: GroundTruth,
         matches: Sequence[tuple[Tensor, Tensor]],
     ) -> dict[str, Tensor]:
-        """Losses of queries with known matches (`MapHead.known_losses`).
+        """Compute the losses of queries with known matches (`MapHead.known_losses`).
 
         Args:
             group: Name, weight and losses of the queries.
             layers: Predictions of the queries, after each layer.
             truths: Ground truth of the batch.
-            matches: Matched pairs of each sample: indices of the queries, increasing, and indices
+            matches: Matched pairs of each sample, as increasing indices of the queries and indices
                 of the ground truths, on the CPU. (m,) each
         """
         ...
@@ -63,7 +64,7 @@ class FlowHook:
     """
 
     def start(self, head: FlowHead, start: FlowStart) -> FlowStart:
-        """Input of the first decoder layer. Further queries are appended to the given ones.
+        """Return the input of the first decoder layer: ``start``, with any new queries appended.
 
         Args:
             head: The head.
@@ -72,7 +73,7 @@ class FlowHook:
         return start
 
     def refine(self, head: FlowHead, layer: int, refined: Tensor) -> Tensor:
-        """References after a layer.
+        """Return the references after a layer.
 
         Args:
             head: The head.
@@ -82,7 +83,7 @@ class FlowHook:
         return refined
 
     def between(self, head: FlowHead, layer: int, queries: Queries) -> Queries:
-        """Queries of the next layer. Also called after the last layer.
+        """Return the queries of the next layer. The method is also called after the last layer.
 
         Args:
             head: The head.
@@ -92,7 +93,7 @@ class FlowHook:
         return queries
 
     def outputs(self, head: FlowHead, layers: list[Predictions]) -> list[Predictions]:
-        """Predictions of the head, without the queries that the hook has appended.
+        """Return the predictions of the head without the queries that the hook has appended.
 
         Args:
             head: The head.
@@ -109,7 +110,7 @@ class FlowHook:
         """
 
     def losses(self, head: FlowHead, truths: GroundTruth) -> dict[str, Tensor]:
-        """Further losses by name. The names contain ``loss``.
+        """Return further losses by name. The names contain ``loss``.
 
         Args:
             head: The head.
@@ -131,7 +132,7 @@ class FlowPart(Protocol):
     name: str
 
     def hook(self, head: FlowHead, truths: GroundTruth) -> FlowHook:
-        """Hook of a training batch.
+        """Create the hook of a training batch.
 
         Args:
             head: The head.

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 def mlp(*dims: int) -> nn.Sequential:
     """Multilayer perceptron with a ReLU between its linear layers.
 
-    The ReLUs do not run in place. A linear layer returns a view, and an in-place change of a view
-    costs a tensor of zeros and two copies in the backward pass.
+    The ReLUs do not run in place, because a linear layer returns a view. The backward pass of an
+    in-place change of a view needs an extra tensor of zeros and two copies.
 
     Args:
         dims: Channels of the input, of each hidden layer, and of the output.
@@ -27,7 +27,7 @@ def mlp(*dims: int) -> nn.Sequential:
 
 
 def feed_forward(embed_dims: int, ffn_dims: int, dropout: float) -> FFN:
-    """Feed-forward network of mmcv, with its residual; the ReLU does not run in place (`mlp`).
+    """Feed-forward network of mmcv, including the residual. The ReLU is not in place (see `mlp`).
 
     Args:
         embed_dims: Channels of the input and the output.

@@ -22,7 +22,7 @@ Instances = Sequence[InstanceData]
 
 
 class LossHead(DetectionHead):
-    """Base class of heads with losses of matched pairs.
+    """Base class of heads whose losses compare predictions with matched ground truth.
 
     Attributes:
         query_groups: Groups of queries. Each group is matched with the ground truth separately;
@@ -157,7 +157,7 @@ class LossHead(DetectionHead):
             layers: Predictions of a query group, after each layer.
             truths: Ground truth of the batch.
             metas: Meta dict of each sample.
-            repeats: Number of queries that each ground truth is matched with.
+            repeats: Number of queries to which each ground truth is matched.
         """
         predictions = Predictions.join(layers)
         matches = self.assigner.assign(predictions, truths, metas=metas, repeats=repeats)
@@ -166,7 +166,7 @@ class LossHead(DetectionHead):
     def pairs(
         self, predictions: Predictions, truths: GroundTruth, matches: MapMatches
     ) -> MatchedPairs:
-        """Matched pairs, with their number averaged over the ranks.
+        """Build the matched pairs, and average their number over the ranks.
 
         Args:
             predictions: Predictions of the matched layers.
@@ -179,7 +179,7 @@ class LossHead(DetectionHead):
         return MatchedPairs(predictions, truths, matches=matches, avg_factor=avg_factor)
 
     def group_losses(self, group: QueryGroup, pairs: MatchedPairs) -> Tensors:
-        """Weighted losses of a query group in all layers, and statistics of the first group.
+        """Weighted losses of a query group in all layers; for the first group, also statistics.
 
         Args:
             group: Query group.

@@ -23,8 +23,8 @@ class MapLoss(nn.Module, NeedsTargets):
         loss_weight: Weight of the loss, or a weight for each class, applied to the pairs of the
             class.
         last_layer_only: Compute the loss for the last decoder layer only.
-        first_group_only: Compute the loss for the first query group only. No other group
-            predicts after the training.
+        first_group_only: Compute the loss for the first query group only, the only group that is
+            used in prediction.
 
     Attributes:
         name: Name of the loss, unique in a head. It is logged as ``loss_<name>``.
@@ -75,7 +75,7 @@ class MapLoss(nn.Module, NeedsTargets):
         return True
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Values of each pair, which are summed. (M, ...)"""
+        """Values of each of the M pairs, which `by_layer` sums. (M, ...)"""
         raise NotImplementedError
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
@@ -89,8 +89,8 @@ class MapLoss(nn.Module, NeedsTargets):
         """Weighted loss of each layer.
 
         Args:
-            pairs: Pairs of all layers. If a subclass overrides `forward`, `forward` is called for
-                the pairs of each layer. Otherwise `values` is called once.
+            pairs: M pairs of all L layers. If a subclass overrides `forward`, `forward` is called
+                for the pairs of each layer. Otherwise `values` is called once.
 
         Returns:
             The losses. (L,)
@@ -101,8 +101,8 @@ class MapLoss(nn.Module, NeedsTargets):
         has_class_weights = isinstance(self.loss_weight, Sequence)
         if has_class_weights:
             weights = class_weights(self.loss_weight, pairs.gt_labels)
-            # The axis of the pairs is moved to the end, where the weights (M,) are broadcast, and
-            # back to the front.
+            # The axis of the pairs is moved to the end, so that the weights (M,) are broadcast, and
+            # then back to the front.
             values = (weights * values.movedim(0, -1)).movedim(-1, 0)
         layer_values = pairs.by_layer(values)  # (L, M / L, ...)
         sums = layer_values.flatten(1).sum(1) / pairs.avg_factor

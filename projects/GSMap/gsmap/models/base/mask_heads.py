@@ -1,7 +1,7 @@
 """Auxiliary heads that predict masks in bird's-eye and camera view, used in training only.
 
-Each has a ``name``, the ``transforms`` that make its target, and a method
-``loss(bev_outputs, samples)``.
+Each head has the name of its loss (``name``), the names of the transforms that make its target
+(``transforms``), and a method ``loss(bev_outputs, samples)``.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ Samples = Sequence[Det3DDataSample]
 
 
 def stack_targets(head: Any, samples: Samples, name: str, device: torch.device) -> Tensor:
-    """Training target of all samples, stacked.
+    """Stack the training targets of all samples.
 
     Args:
         head: Auxiliary head, for the name of its transform in the error.
@@ -56,7 +56,8 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
         loss_weight: Weight of the cross-entropy.
         pos_weight: Weight of foreground cells in the cross-entropy.
         dice_weight: Weight of the dice loss, which treats the masks of a sample as one.
-        num_masks: Number of classes for one mask per class, or 1 for one mask of all elements.
+        num_masks: Number of predicted masks: the number of classes for one mask per class, or 1 for
+            one mask of all elements.
         name: Name of the loss.
 
     Attributes:
@@ -105,7 +106,7 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
             The loss. ()
 
         Raises:
-            ValueError: If a sample has no target, or a target of another number of masks.
+            ValueError: If a sample has no target, or its target does not have ``num_masks`` masks.
         """
         feats = bev_outputs[self.feats]
         target = stack_targets(self, batch_data_samples, name=self.target, device=feats.device)

@@ -1,4 +1,4 @@
-"""Masks of map elements: rasters, and drawing of the ground truth."""
+"""Masks of map elements: their rasters, and drawing of the ground truth on them."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ from gsmap.utils.errors import InputError
 
 
 class ElementMasks:
-    """Rasters for the comparison of predictions with the ground truth, which is drawn on them.
+    """Rasters on which masks of predictions are compared with masks of the ground truth.
 
     Args:
         grid: Extent of the map.
@@ -113,7 +113,7 @@ class ElementMasks:
             grid: The raster.
 
         Returns:
-            Masks of the elements, sample after sample. (T, H, W)
+            Masks of all T elements of the batch, sample after sample, in [0, 1]. (T, H, W)
 
         Raises:
             ValueError: If ``source`` is ``"full"`` and a sample has no polylines.

@@ -21,9 +21,9 @@ class HostCosts(NamedTuple):
     """Inputs of the assignment on the CPU.
 
     Attributes:
-        samples: Costs of each sample: one matrix per cost, of the predictions of all layers with
-            the ground truths of the sample. (n, L * N, K) each
-        labels: Class indices of all ground truths. (T,)
+        samples: Values of the n costs for each sample. Rows are the predictions of all layers,
+            columns the ground truths of the sample. (n, L * N, K) each
+        labels: Class indices of the T ground truths of the batch. (T,)
     """
 
     samples: list[Tensor]
@@ -31,11 +31,11 @@ class HostCosts(NamedTuple):
 
 
 class MapAssigner:
-    """Hungarian assignment with summed costs, and the closest point order (MapTR Eqs. 3-5).
+    """Hungarian assignment by the sum of costs, and choice of point orders (MapTR Eqs. 3-5).
 
     Args:
         match_costs: Configs of the costs. A cost is called for each sample with the predictions of
-            all L layers, the ground truth and the meta dict, and returns a matrix. (L * N, K)
+            all L layers, the ground truth and the meta dict. It returns a matrix. (L * N, K)
 
     Raises:
         ValueError: If there is no cost.
@@ -63,16 +63,17 @@ class MapAssigner:
     ) -> MapMatches:
         """Match each ground truth with ``repeats`` predictions of its sample, in every layer.
 
-        There is one copy of all costs from the device, and one copy of all matches to it.
+        The costs of the whole batch are copied from the device at once, and the matches are copied
+        to the device at once.
 
         Args:
             predictions: Predictions of L layers, N queries each.
-            truths: Ground truth, K elements of a sample.
+            truths: Ground truth, with K elements in a sample.
             metas: Meta dict of each sample, with the ``token`` of the sample for errors.
             repeats: Number of predictions that each ground truth is matched with.
 
         Returns:
-            The matches, min(N, K * repeats) of each sample in a layer.
+            The matches, min(N, K * repeats) for each sample and layer.
 
         Raises:
             FloatingPointError: If a cost is not finite, or if a score of a sample without ground
@@ -100,12 +101,12 @@ class MapAssigner:
         truths: GroundTruth,
         pairs: Sequence[tuple[Tensor, Tensor]],
     ) -> MapMatches:
-        """Matches of pairs that are known before the decoder runs.
+        """Create the matches of pairs that are known before the decoder runs.
 
         Args:
             predictions: Predictions of L layers, N queries each.
             truths: Ground truth.
-            pairs: Matched pairs of each sample: indices of the queries, increasing, and indices of
+            pairs: Matched pairs of each sample, as increasing indices of the queries and indices of
                 the ground truths, on the CPU. (m,) each
         """
         num_layers = len(predictions.layers)
@@ -129,7 +130,7 @@ class MapAssigner:
             truths: Ground truth.
             pairs: Matched pairs of each sample: indices of the queries and of the ground truths, on
                 the CPU. (L, m) each
-            labels: Class indices of all ground truths, on the CPU. (T,)
+            labels: Class indices of the T ground truths of the batch, on the CPU. (T,)
 
         Returns:
             The matches.
@@ -145,7 +146,7 @@ class MapAssigner:
             row = gt + truths.first[index]  # index among the ground truths of all samples
             indices.append(torch.stack([sample, query, query + first_query, gt, row]))
             counts.append(query.shape[1])
-        host_indices = torch.cat(indices, dim=2)  # (5, L, M)
+        host_indices = torch.cat(indices, dim=2)  # (5, L, M), M pairs in each layer
         (device_indices,) = upload([host_indices], predictions.scores.device)
         samples, query_inds, joined_inds, gt_inds, rows = device_indices.unbind(0)
         orders = truths.pts_shifts[rows]  # (L, M, S, P, 2 or 3)
@@ -178,8 +179,9 @@ class MapAssigner:
         """
         class_costs = self._class_costs(predictions)
         num_rows = predictions.scores.shape[1]
-        # Tensors in the order: for each sample, its matrix of each cost, or a sum of its scores if
-        # it has no ground truth; then the labels. They are copied as one vector, and split again.
+        # All tensors are copied as one vector, which is then split again. First are the matrices of
+        # each sample, one per cost. A sample without ground truth has a check of its scores instead
+        # of matrices. Last are the labels.
         blocks: list[Tensor] = []
         for index, count in enumerate(truths.counts):
             pred = predictions.sample(index)
@@ -206,9 +208,9 @@ class MapAssigner:
         return HostCosts(samples, labels=next(host_blocks).long())
 
     def _class_costs(self, predictions: Predictions) -> list[Tensor | None]:
-        """Costs of every class, None for costs that depend on more. (B, L * N, classes) each"""
-        # The costs of mmdet read the scores of predictions and the labels of ground truths. Here
-        # the predictions are of all samples, and every class takes the place of a ground truth.
+        """Compute costs by class; None for a cost with other inputs. (B, L * N, classes) each"""
+        # The costs of mmdet read the scores of predictions and the labels of ground truths. Here,
+        # they receive the predictions of all samples, and each class in place of a ground truth.
         scores = predictions.scores
         all_scores = SimpleNamespace(scores=scores.flatten(0, 1))
         all_classes = SimpleNamespace(labels=torch.arange(scores.shape[2], device=scores.device))
@@ -222,7 +224,7 @@ class MapAssigner:
 
 
 def depends_on_class_only(cost: Any) -> bool:
-    """Whether a cost of mmdet depends on scores and labels only, so that it is computed by class.
+    """Whether a cost depends on scores and labels only, so that it can be computed by class.
 
     Args:
         cost: Built cost.
@@ -233,7 +235,7 @@ def depends_on_class_only(cost: Any) -> bool:
 def solve_assignment(
     costs: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None, repeats: int = 1
 ) -> tuple[Tensor, Tensor]:
-    """Pairs of predictions and ground truths with the least sum of costs.
+    """Find the pairs of predictions and ground truths with the least sum of costs.
 
     Args:
         costs: Costs of N predictions with K ground truths, on the CPU. (n, N, K)
@@ -242,7 +244,8 @@ def solve_assignment(
         repeats: Number of predictions that each ground truth is matched with.
 
     Returns:
-        Indices of the predictions, increasing, and indices of the ground truths. (m,) each
+        Increasing indices of the predictions, and indices of the ground truths, with
+        m = min(N, K * repeats). (m,) each
 
     Raises:
         FloatingPointError: If a cost is not finite.
@@ -250,7 +253,8 @@ def solve_assignment(
     check_finite(costs, names, img_meta=img_meta)
     repeated_costs = np.tile(costs.sum(0).numpy(), repeats)  # (N, repeats * K)
     rows, cols = linear_sum_assignment(repeated_costs)
-    num_truths = max(costs.shape[2], 1)  # columns k, K + k, 2 K + k, .. are of ground truth k
+    # The columns k, K + k, 2 K + k, .. belong to ground truth k. With K = 0, there are no columns.
+    num_truths = max(costs.shape[2], 1)
     return torch.from_numpy(rows), torch.from_numpy(cols % num_truths)
 
 
@@ -277,7 +281,7 @@ def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] 
 
 
 class MapCost:
-    """Base class of matching costs with a check of the head. Costs need not derive from it.
+    """Base class of matching costs that check the head. Other costs need not derive from it.
 
     Args:
         weight: Weight of the cost, or a weight for each class, applied to the ground truths of the
@@ -307,8 +311,8 @@ class MapCost:
 
 
 class PointsCost(MapCost):
-    """Base class of matching costs of points. Its distance chooses the order of matched points."""
+    """Base class of matching costs of points. Its distance also selects the closest point order."""
 
     def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
-        """Distance of each coordinate. Two (..., P, 2 or 3) -> (..., P, 2 or 3)"""
+        """Distance along each axis. (..., P, 2 or 3) and (..., P, 2 or 3) -> (..., P, 2 or 3)"""
         return (pts - targets).abs()

@@ -200,14 +200,14 @@ class SampleView:
 
 
 class MapMatches(NamedTuple):
-    """Indices of the matched pairs of L layers, M in each, sorted by sample and query.
+    """Indices of the matched pairs of L layers, each with M pairs sorted by sample and query.
 
     Attributes:
         samples: Index of the sample in the batch. (L, M)
         query_inds: Index of the query in its layer. (L, M)
         joined_inds: Index of the query among the queries of all layers. (L, M)
         gt_inds: Index of the ground truth in its sample. (L, M)
-        rows: Index of the ground truth among the T of the batch. (L, M)
+        rows: Index of the ground truth among all T elements of the batch. (L, M)
         order_inds: Index of the closest equivalent point order of the ground truth. (L, M)
         host_labels: Class index of the ground truth, kept on the CPU. (L, M)
         counts: Number of pairs of each sample, in one layer: B integers.
@@ -224,17 +224,17 @@ class MapMatches(NamedTuple):
 
 
 class MatchedPairs:
-    """Matched pairs of a batch: M pairs of L layers in all, layer after layer.
+    """Matched pairs of a batch: M pairs in total, concatenated from L layers.
 
-    Each layer has M / L pairs, sorted by sample and query (in `MapMatches`, M is the number of one
-    layer). Attributes are computed on first access and cached.
+    Each layer has M / L pairs, sorted by sample and query. (In `MapMatches`, M is the number of
+    pairs of one layer.) Properties are computed on first access and cached.
 
     Args:
         predictions: Predictions of the layers, of one query group.
         truths: Ground truth of the batch.
         matches: Indices of the pairs.
-        avg_factor: Divisor of losses: number of pairs of a layer, averaged over the ranks, at
-            least 1. ()
+        avg_factor: Divisor of losses: the number of pairs of one layer, averaged over the ranks,
+            at least 1. ()
 
     Attributes:
         num_layers: Number L of layers.
@@ -268,7 +268,7 @@ class MatchedPairs:
         self._layer_pairs: dict[int, MatchedPairs] = {}
 
     def layer(self, number: int) -> "MatchedPairs":
-        """Pairs of one layer, which reuse the cached attributes of these pairs.
+        """Pairs of one layer. Cached properties of all pairs are reused, not computed again.
 
         Args:
             number: Index of the layer. Negative indices count from the last layer.
@@ -279,7 +279,7 @@ class MatchedPairs:
         if number not in self._layer_pairs:
             self._layer_pairs[number] = self._select_layer(number)
         layer_pairs = self._layer_pairs[number]
-        # `vars` holds the values of cached properties that have been computed.
+        # Cached properties that have been computed are in `vars`. Copy their part of the layer.
         for name, values in vars(self).items():
             is_cached = isinstance(getattr(type(self), name, None), cached_property)
             if is_cached and name not in vars(layer_pairs):

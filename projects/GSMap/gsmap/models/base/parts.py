@@ -42,7 +42,7 @@ class AuxHead(Protocol):
 
 
 def with_defaults(settings: Mapping[str, Any] | None, **defaults: Any) -> PartConfig:
-    """Config of a part: the given settings, and defaults for those that are not given.
+    """Config of a part: the given settings, and default values of all other settings.
 
     Args:
         settings: Given settings, or None.
@@ -101,7 +101,7 @@ def set_points_weight(
         parts: Configs of losses or costs.
         kind: Class of the loss or cost of the points. Subclasses do not count.
         weight: New weight. None keeps the configs as they are.
-        key: Name of the setting that holds the weight.
+        key: Name of the setting that is the weight.
         registry: Registry of the classes of the configs.
 
     Raises:
@@ -148,7 +148,7 @@ def check_unique_names(names: Sequence[str], kind: str) -> None:
 
 
 def class_weights(weight: WeightConfig, labels: Tensor) -> Tensor:
-    """Weight of each element, by its class.
+    """Look up the weight of each element by its class.
 
     Args:
         weight: One weight, or a weight for each class.

@@ -14,12 +14,12 @@ _ADDED_SETTINGS: dict[str, HeadSetting] = {}
 
 
 class PointTable(nn.Embedding):
-    """Embeddings of the points of an instance, one table for all instances.
+    """Embeddings of the points of an instance, shared by all instances.
 
     Args:
         num_points: Points per instance P.
-        embed_dims: Channels C of a query. An embedding has 2 C channels, for the query and its
-            position.
+        embed_dims: Channels C of a query. An embedding has 2 C channels: C for the query and C for
+            its positional encoding.
     """
 
     def __init__(self, num_points: int, embed_dims: int) -> None:

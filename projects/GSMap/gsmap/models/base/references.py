@@ -11,7 +11,7 @@ from gsmap.structures.grid import BEVGrid
 
 
 class Reference:
-    """Decoding of references to points.
+    """Base class of references that can be decoded to points.
 
     Attributes:
         outputs: Names of the fields that `decode` returns.
@@ -34,7 +34,7 @@ class Reference:
 
 
 class RefinedReference(Reference):
-    """References that decoder layers refine.
+    """Base class of references that decoder layers refine.
 
     A reference has D entries. A query has n references: n = 1 for the query of a point, n = P for
     the query of an instance.

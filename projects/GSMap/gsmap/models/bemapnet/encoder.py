@@ -1,4 +1,4 @@
-"""BeMapNet's BEV encoder: BEV cells attend to all pixels, encoded by their ground points."""
+"""BeMapNet's BEV encoder: BEV cells attend to all pixels, whose positions are ground points."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -31,18 +31,19 @@ class BezierBEVEncoder(CameraEncoder):
         in_channels: Channels of the image features.
         bev_pixel_m: Side of a BEV cell in metres.
         embed_dims: Channels C of the BEV features.
-        num_layers: Number of self-attention layers of the pixels, and number of BEV layers.
+        num_layers: Number of self-attention layers of the pixels, and number of BEV layers, in
+            which cells attend to pixels.
         layer_cfg: Settings ``num_heads``, ``ffn_dims`` and ``dropout`` of all layers.
         position_dims: Hidden channels of the network of the positional encoding.
-        position_size: Rows and columns of the image that the feature maps cover, for the viewing
-            rays. By default the size before cropping, as in the released code; None for the size
-            of the cropped images.
-        from_camera: Whether the origin of ground points is below their camera, as in the released
-            code, instead of the origin of the ground frame.
+        position_size: Rows and columns of the image that the feature maps are taken to cover when
+            viewing rays are computed. The default is the size before cropping, as in the released
+            code. None is the size of the cropped images.
+        from_camera: Whether ground points are relative to the point below their camera, as in the
+            released code, instead of relative to the origin of the ground frame.
         init_cfg: Initialisation config of mmengine.
 
     Raises:
-        ValueError: If ``num_layers`` has not two entries, or the second is less than 1.
+        ValueError: If ``num_layers`` does not have two entries, or the second is less than 1.
     """
 
     calibration = ("ground_from_img",)
@@ -101,8 +102,8 @@ class BezierBEVEncoder(CameraEncoder):
 
         Args:
             feats: Image features. (B, V, C', h, w)
-            calibration: ``ground_from_img``, transforms from pixels (u * d, v * d, d, 1) to the
-                ground frame, in metres. (B, V, 4, 4)
+            calibration: ``ground_from_img``, transforms from pixels (u * d, v * d, d, 1) with the
+                depth d to the ground frame, in metres. (B, V, 4, 4)
             img_shape: Rows and columns of the padded images.
 
         Returns:
@@ -116,12 +117,12 @@ class BezierBEVEncoder(CameraEncoder):
         sources = self.input_proj(images).unflatten(0, feats.shape[:2])  # (B, V, C, h, w)
         sources = sources.permute(0, 1, 3, 4, 2).flatten(1, 3)  # (B, S, C), S = V * h * w
         source_pos = self.positions(points, on_ground)
-        # Attention needs a key, so samples without any ground pixel are not masked.
+        # Attention needs at least one key, so samples without any ground pixel are not masked.
         ignored = ~on_ground & on_ground.any(dim=-1, keepdim=True)  # (B, S)
         for layer in self.source_layers:
             sources = layer(sources, source_pos, key_padding_mask=ignored)
-        # BEV cells are in the order of line heads, as in the released code: row 0 is at the front.
-        # `turn_raster` converts the outputs to the order of `grid`.
+        # In the layers, row 0 of the BEV cells is at the front, as in line heads and in the
+        # released code. `turn_raster` converts the outputs to the order of `grid`.
         shape = front_size(self.grid)
         cells_yx = centres([shape], feats.device).flip(-1)  # (H * W, 2), row first, in [0, 1]
         cell_centres = self.grid.metres_from_front(cells_yx)
@@ -147,17 +148,18 @@ class BezierBEVEncoder(CameraEncoder):
         """Intersect the viewing rays of feature pixels with the ground.
 
         Args:
-            ground_from_img: Transforms from pixels (u * d, v * d, d, 1) to the ground frame, in
-                metres. (B, V, 4, 4)
+            ground_from_img: Transforms from pixels (u * d, v * d, d, 1) with the depth d to the
+                ground frame, in metres. (B, V, 4, 4)
             size: Rows h and columns w of the image features, S = V * h * w pixels.
             img_shape: Rows and columns of the padded images.
 
         Returns:
-            Points as distances ahead and to the left in metres (B, S, 2), and a mask that is True
-            for pixels below the horizon. (B, S)
+            Points as (distance ahead, distance to the left) in metres, (B, S, 2), and a mask that
+            is True for pixels below the horizon, (B, S).
 
         Raises:
-            ValueError: If ``position_size`` has fewer rows than the images, or other columns.
+            ValueError: If ``position_size`` has fewer rows than the images, or another number of
+                columns.
         """
         matrices = ground_from_img.float()
         image_size = self.position_size or img_shape
@@ -185,9 +187,9 @@ class BezierBEVEncoder(CameraEncoder):
         """Compute positional encodings of ground points.
 
         Args:
-            points: Points as distances ahead and to the left, in metres. (B, Q, 2)
-            on_ground: True for points on the ground. The sine encoding of other points is set to 0.
-                None if all points are on the ground. (B, Q)
+            points: Points as (distance ahead, distance to the left) in metres. (B, Q, 2)
+            on_ground: True for pixels whose rays meet the ground. The sine encoding of others is
+                set to 0. None if all points are on the ground. (B, Q)
 
         Returns:
             Positional encodings. (B, Q, C)

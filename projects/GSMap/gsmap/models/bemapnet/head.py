@@ -27,7 +27,9 @@ from gsmap.utils.errors import InputError
 
 @dataclass(frozen=True)
 class CurveReference(Reference):
-    """References of points along curves: (from the left, from the front) in [0, 1].
+    """References of points along curves: distances from the left and the front edge of the map.
+
+    Both distances are in [0, 1].
 
     Args:
         grid: Extent of the map, in metres.
@@ -172,7 +174,7 @@ class BezierHead(LineHead):
             label: Class index.
             states: States of the lines. (B, n, C)
             mean: Mean of the features of all coordinates of the map. The logit of a coordinate is
-                its product with D outputs of a branch. (D,)
+                the scalar product of this mean and D outputs of a branch. (D,)
 
         Returns:
             Logits of the joints (B, n, k + 1, 2), of the inner points (B, n, k, d - 1, 2) and of
@@ -234,7 +236,7 @@ class BezierHead(LineHead):
         for label, curve in enumerate(cast(Iterable[Curve], self.curves)):
             is_class = instances.labels_3d == label
             counts = instances.num_pts[is_class]  # numbers of control points
-            largest = curve.weights.shape[-1]  # number of control points of a curve of all pieces
+            largest = curve.weights.shape[-1]  # largest number of control points of a curve
             has_too_many = counts > largest
             has_half_pieces = (counts - 1) % curve.degree != 0
             if (has_too_many | has_half_pieces).any():

@@ -1,7 +1,7 @@
 """Mapping between the state keys of the released BeMapNet and of this project.
 
-`rules_of` takes the prefix of the released keys, the prefix of the keys here, and the rest of the
-keys as words: ``released=here``, or one name if the rest is equal on both sides.
+`rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
+Each word of the text continues both prefixes: ``released=here``, or one name for both.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]
     Args:
         path: Name of the path, ``down`` or ``up``.
         release_path: Name of the path in the release.
-        number: Number of the path in the names of the release's weights.
+        number: Number of the path in the names of the fusion weights of the release.
         levels: Levels in the order of the path.
     """
     rules: list[tuple[str, str]] = []
@@ -50,7 +50,7 @@ def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]
 
 
 def _projection_rules() -> Rules:
-    """Return the rules of the projections, whose convolutions the release nests deeper."""
+    """Return the rules of the projections. The release nests their convolutions deeper."""
     rules: list[tuple[str, str]] = []
     for theirs, ours in _PROJECTIONS.items():
         rules.append((f"{_NECK}0.{theirs}0.conv.", f"img_neck.{ours}0."))

@@ -42,7 +42,7 @@ class TrueCurves(NamedTuple):
     """Annotated lines of one class in one sample."""
 
     controls: Tensor  # (from the left, from the front) in [0, 1]; unused ones are 0 (K, P, 2)
-    pieces: Tensor  # number of pieces less one (K,)
+    pieces: Tensor  # number of pieces minus one (K,)
     curves: Tensor  # points (from the left, from the front) in [0, 1] (K, 100, 2)
     masks: Tensor  # 0 and 1, float (K, H, W)
 
@@ -64,9 +64,10 @@ class BezierLosses(LineLosses):
         mask_points: Number of points, >= 10, at which masks are compared: random points in
             matching, mostly the least certain points of the prediction in the loss. None compares
             all pixels.
-        redrawn_in_px: Whether to keep a peculiarity of the released code. If a line is hidden by
-            others of its class, its mask is drawn from its curve. This converts the targets of the
-            curve loss from [0, 1] to pixels (done by the head, which creates the targets).
+        redrawn_in_px: Whether the targets of the curve loss are in pixels instead of [0, 1] for
+            lines whose masks were drawn from their curves, as in the released code. Masks are drawn
+            so for all lines of a class if one of them is completely hidden by others of the class.
+            This setting is used by the head, which creates the targets.
 
     Raises:
         ValueError: If ``mask_points`` is less than 10.
@@ -166,11 +167,11 @@ class BezierLosses(LineLosses):
             rows.append(match.rows)
             sample_lines.append(_select(case.lines, match.rows))
             sample_truths.append(_select(case.truth, match.cols))
-        number = max(num_annotated, 1)
+        divisor = max(num_annotated, 1)
         lines: BezierLines = _concatenate(sample_lines)
         truth: TrueCurves = _concatenate(sample_truths)
         points = neighbourhood(lines.curves, truth.masks.shape[-2:])
-        values = lines.curves[..., 0]  # an empty tensor if there is no match
+        values = lines.curves[..., 0]  # empty if there is no match, replaced otherwise
         if len(values):
             values = point_sample(truth.masks[:, None], points)[:, 0]
         controls = lines.controls * lines.control_mask[..., None]
@@ -182,7 +183,7 @@ class BezierLosses(LineLosses):
             "curve": self.curve * _mean_difference(lines.curves, truth.curves),
             "recovery": self.recovery * recovery_loss(values),
         }
-        losses = {name: value.sum() / number for name, value in line_losses.items()}
+        losses = {name: value.sum() / divisor for name, value in line_losses.items()}
         losses["cls"] = self.class_loss(cases, rows)
         return losses
 

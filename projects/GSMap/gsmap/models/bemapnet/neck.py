@@ -25,7 +25,9 @@ def downsample(feats: Tensor) -> Tensor:
     """Max-pool a map with a 3x3 kernel and stride 2, padded with zeros.
 
     An axis of even size is padded by one cell after the last cell. An axis of odd size is also
-    padded by one cell before the first cell. Of n cells, ``(n + 1) // 2`` remain. (B, C, h, w)
+    padded by one cell before the first cell. An axis of n cells is reduced to ``(n + 1) // 2``.
+
+    (B, C, h, w) -> (B, C, (h + 1) // 2, (w + 1) // 2)
     """
     # Concatenation, not F.pad: ONNX Runtime (1.31) merges padding into the pooling, which pads with
     # -inf instead of zeros.
@@ -64,7 +66,7 @@ class FusionConv(nn.Module):
 
 
 class BiFPNRound(nn.Module):
-    """Fusion of all levels from the coarsest to the finest one, and back.
+    """Fusion of all levels on a path from the coarsest to the finest one, and on a path back.
 
     Args:
         channels: Channels C of each level.
@@ -124,8 +126,8 @@ class BiFPN(BaseModule):
         self.size = (int(size[0]), int(size[1]))
         self.inputs = nn.ModuleList(_projection(inputs, channels) for inputs in in_channels)
         self.coarser = _projection(in_channels[-1], channels)
-        # The first round takes these second projections on its path from fine to coarse levels. The
-        # finest level has none.
+        # Second projections of the image features, inputs of the first round on its path from fine
+        # to coarse levels. The finest level has no second projection.
         self.again = nn.ModuleList(_projection(inputs, channels) for inputs in in_channels[1:])
         self.rounds = nn.ModuleList(BiFPNRound(channels) for _ in range(num_rounds))
 
@@ -135,7 +137,7 @@ class BiFPN(BaseModule):
         sixth = downsample(self.coarser(feats[-1]))
         seventh = downsample(sixth)
         levels = [conv(level) for conv, level in zip(self.inputs, feats, strict=True)]
-        back_levels = [levels[0]]  # the finest one, which `BiFPNRound` does not read
+        back_levels = [levels[0]]  # not used: `BiFPNRound` ignores the finest entry
         for conv, level in zip(self.again, feats[1:], strict=True):
             back_levels.append(conv(level))
         levels += [sixth, seventh]

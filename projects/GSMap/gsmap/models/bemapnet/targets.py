@@ -16,15 +16,15 @@ from gsmap.utils.errors import InputError
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class FormatBezierTargets(FormatLineTargets):
-    """Add ``gt_instances_3d`` with the control points of lines, fitted to ``map_instances``.
+    """Add ``gt_instances_3d`` with Bezier control points that are fitted to ``map_instances``.
 
     The fields of the targets and the other settings are described in `FormatLineTargets`.
 
     Args:
-        degrees: Degree of the pieces of each class, 1 to 5. Configs set ``degrees`` of the head,
-            and the head's `target_settings` set it here.
-        pieces: Largest number of pieces of each class, >= 1, set by the head like ``degrees``. As
-            in the released code, further pieces of a line are dropped.
+        degrees: Degree of the Bezier pieces of a line, for each class, 1 to 5. Configs set
+            ``degrees`` of the head, and the head's `target_settings` set it here.
+        pieces: Largest number of pieces of a line, for each class, >= 1, set by the head like
+            ``degrees``. As in the released code, further pieces of a line are dropped.
         max_error_m: Largest mean deviation of a piece from its line, in metres.
 
     Raises:
@@ -52,7 +52,7 @@ class FormatBezierTargets(FormatLineTargets):
         return max(counts)
 
     def polyline(self, points: Points, label: int) -> Points:
-        """Return points along the curve of control points. (P, 2) -> (n, 2)"""
+        """Return points along the curve that control points define. (P, 2) -> (n, 2)"""
         return curve_points(points, self.degrees[label])
 
     def points(self, line: Points, label: int, grid: BEVGrid) -> Points:
@@ -79,7 +79,7 @@ class FormatBezierTargets(FormatLineTargets):
         )
         first_u = controls[0, 0]
         last_u = controls[-1, 0]
-        if first_u > last_u:
+        if first_u > last_u:  # the line begins at its rear end
             controls = controls[::-1]
         largest = degree * self.pieces[label] + 1
         return controls[:largest] / size_m

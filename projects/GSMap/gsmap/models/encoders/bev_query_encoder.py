@@ -1,4 +1,4 @@
-"""BEV encoder with one learned query per cell, which attends to the BEV and to the cameras."""
+"""BEV encoder with one learned query per cell, which attends to other cells and to the cameras."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -45,13 +45,13 @@ class BEVSelfAttention(BEVDeformableAttention):
         )
 
     def weights(self, query: Tensor) -> Tensor:
-        """Attention weights: a softmax per entry of the queue, averaged over the queue.
+        """Attention weights: a softmax per entry of the queue, divided by the number of entries.
 
         Args:
-            query: Entries of both places of the queue, concatenated. (B, Q, 2 C)
+            query: Both entries of the queue, concatenated along the channels. (B, Q, 2 C)
 
         Returns:
-            Weights that sum to 1 over S. (B, Q, heads, S)
+            Weights that sum to 1 over the S samples of both entries. (B, Q, heads, S)
         """
         logits = self.attention_weights(query).float()
         # (B, Q, heads, 2, S / 2): the samples of each entry of the queue
@@ -69,9 +69,10 @@ class BEVEncoderLayer(nn.Module):
         num_points: Samples of the self-attention, per head and entry of its queue.
         ffn_dims: Hidden channels of the feed-forward network.
         dropout: Probability to drop a value in training.
-        released_pairs: The self-attention reads each sample's queries concatenated with themselves.
-            With this flag, the first half of sample b is taken from sample floor(b / 2), as in the
-            released code of BEVFormer. The result of a sample then depends on its batch.
+        released_pairs: By default, the self-attention reads the queries of each sample concatenated
+            with themselves. If True, the first half of the channels of sample b is taken from
+            sample floor(b / 2), as in the released code of BEVFormer. The result of a sample then
+            depends on the other samples of its batch.
     """
 
     def __init__(
@@ -110,7 +111,8 @@ class BEVEncoderLayer(nn.Module):
             grid: The cells, H x W = Q.
             feats: Image features with the embeddings of camera and level. (B, V, C, h, w), or a
                 list with one such tensor per level
-            projection: Image coordinates of the pillars, and the visible cells of each camera.
+            projection: Image coordinates of the pillars (vertical rows of points above the cells),
+                and the visible cells of each camera.
 
         Returns:
             The updated queries. (B, Q, C)
@@ -118,7 +120,7 @@ class BEVEncoderLayer(nn.Module):
         centres = self.centres(grid, query.device).view(1, -1, 2)
         partner = query
         if self.released_pairs:
-            # The queries of samples 0, 0, 1, 1, ...
+            # Entry b has the queries of sample floor(b / 2): samples 0, 0, 1, 1, ...
             partner = query.repeat_interleave(2, 0)[: len(query)]
         pair = torch.cat([partner, query + query_pos], dim=-1)  # (B, Q, 2 C)
         bev = query.transpose(1, 2).unflatten(-1, (grid.height, grid.width))  # (B, C, H, W)
@@ -127,7 +129,7 @@ class BEVEncoderLayer(nn.Module):
         return self.norms[2](self.ffn(query))
 
     def centres(self, grid: BEVGrid, device: torch.device) -> Tensor:
-        """Reference point of each cell's self-attention, [0, 1] over the map. (H, W, 2)"""
+        """Centre of each cell, the reference point of its self-attention, [0, 1]. (H, W, 2)"""
         return grid.norm_from_metres(grid.pixel_centres(device))
 
 
@@ -135,7 +137,8 @@ class BEVEncoderLayer(nn.Module):
 class BEVQueryEncoder(CameraEncoder):
     """BEV encoder with a learned query per cell: BEVFormer without history, or GKT.
 
-    The camera cross-attention decides which of the two it is.
+    ``cross_attn`` selects one of the two. A pillar is the vertical row of points above a cell that
+    is projected into the cameras.
 
     Args:
         cross_attn: Config of the camera cross-attention of every layer.
@@ -147,7 +150,7 @@ class BEVQueryEncoder(CameraEncoder):
         layer_cfg: Further arguments of :class:`BEVEncoderLayer`.
         num_cams: Number of cameras V.
         with_can_bus: Add an embedding of the motion signals of the vehicle to the queries.
-        num_levels: Levels of image features that are used, at most 4.
+        num_levels: Number of levels of image features that are used, at most 4.
         uniform_positions: Initialise the positional encoding from U[0, 1), as intended by
             BEVFormer. MapTR and its successors start from N(0, 1), because their code leaves the
             default of ``nn.Embedding``.

@@ -17,7 +17,8 @@ from gsmap.utils.errors import InputError
 class SpatialCrossAttention(SamplingAttention):
     """Deformable attention from BEV cells to the cameras, around the projected pillars.
 
-    Sample s belongs to pillar height ``s % num_heights``. Sums over cameras are divided by the
+    A pillar consists of points at several heights above a cell. Sample s of a head is taken near
+    the projection of the point with index ``s % num_heights``. Sums over cameras are divided by the
     number of cameras in which the cell is visible.
 
     Args:
@@ -31,8 +32,9 @@ class SpatialCrossAttention(SamplingAttention):
         ValueError: If ``num_points`` is not a multiple of ``num_heights``.
     """
 
-    # Whether invisible pairs of cell and camera are computed, too, with weight 0. `StaticStep` and
-    # `StaticFrame` set it before they record a CUDA graph, in which sizes of tensors are fixed.
+    # Whether pairs of a cell and a camera that does not show it are computed as well, with weight
+    # 0. `StaticStep` and `StaticFrame` set this before they record a CUDA graph, in which the sizes
+    # of tensors are fixed.
     fixed_sizes = False
 
     def __init__(
@@ -53,7 +55,7 @@ class SpatialCrossAttention(SamplingAttention):
     def forward(
         self, query: Tensor, img_feats: Tensor | Sequence[Tensor], projection: PillarProjection
     ) -> Tensor:
-        """Attend from the cells to the cameras, without the residual.
+        """Attend from the cells to the cameras. The residual is not added.
 
         Args:
             query: Queries of the cells. (B, Q, C)
@@ -64,7 +66,8 @@ class SpatialCrossAttention(SamplingAttention):
             Camera features of every cell. (B, Q, C)
         """
         levels = [img_feats] if isinstance(img_feats, Tensor) else list(img_feats)
-        offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)  # (B, Q, heads, S, 2)
+        # One chunk per level.
+        offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)  # (B, Q, heads, S, 2) each
         weights = self.weights(query).chunk(self.num_parts, 3)
         # `self.num_points` counts the samples of all levels, S * num_parts.
         repeats = self.num_points // (self.num_parts * self.num_heights)
@@ -102,13 +105,13 @@ class SpatialCrossAttention(SamplingAttention):
 
 
 def _visible_cells(visible: Tensor) -> list[Tensor]:
-    """Indices of the visible cells of each camera, for which the host waits once for the GPU.
+    """List the visible cells of each camera. The host waits for the GPU once.
 
     Args:
         visible: Whether a cell is visible in a camera. (B, V, Q)
 
     Returns:
-        Indices of each camera of each sample. B * V tensors (T,)
+        Indices of the T visible cells for each camera of each sample. B * V tensors (T,)
     """
     pairs = visible.flatten(0, 1).cpu()
     indices = [pair.nonzero()[:, 0] for pair in pairs.unbind()]
@@ -123,12 +126,14 @@ def _sample_all_pairs(
     projection: PillarProjection,
     repeats: int,
 ) -> Tensor:
-    """Sum the samples of every cell over all cameras; no size depends on values.
+    """Sum the samples of every cell over all cameras, with tensor sizes independent of values.
 
     Args:
-        value: Projected features of each camera. (B, V, h * w, heads, C)
+        value: Projected features of each camera, with C channels per head.
+            (B, V, h * w, heads, C)
         shape: Rows h and columns w of the features.
-        offsets: Offsets from the projected pillar, as fractions of the map. (B, Q, heads, S, 2)
+        offsets: Offsets from the projected pillar, as fractions of the feature map.
+            (B, Q, heads, S, 2)
         weights: Weight of each sample. (B, Q, heads, S)
         projection: Image coordinates of the pillars, and the visible cells of each camera.
         repeats: Samples per pillar height.

@@ -34,7 +34,8 @@ class CameraEncoder(BaseModule):
 
     Attributes:
         calibration: Names of the arrays that the encoder reads, see `stack_calibration`.
-        num_levels: Number of levels of image features, from the finest on. None: all.
+        num_levels: Number of levels of image features that are used, the finest first; None for
+            all levels.
     """
 
     calibration: tuple[str, ...]
@@ -54,10 +55,12 @@ class CameraEncoder(BaseModule):
             ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and further outputs of `encode`.
 
         Raises:
-            ValueError: If a sample lacks a field or has another number of cameras.
+            ValueError: If a sample lacks a field, or the samples differ in the number of cameras.
         """
         calibration = stack_calibration(img_metas, self.calibration, mlvl_feats[0].device)
-        return self.encode(self.levels(mlvl_feats), calibration, img_metas[0]["batch_input_shape"])
+        feats = self.levels(mlvl_feats)
+        img_shape = img_metas[0]["batch_input_shape"]
+        return self.encode(feats, calibration, img_shape)
 
     def levels(self, mlvl_feats: Sequence[Tensor]) -> Any:
         """Select the levels that `encode` takes: the first one, or a list of the first ones."""

@@ -26,7 +26,7 @@ def _conv_bn_relu(
 
 
 def _camera_mlp(channels: int) -> nn.Sequential:
-    """Build the embedding of a camera's parameter vector (`camera_vector`)."""
+    """Build the network that embeds the parameter vector of a camera (`camera_vector`)."""
     first = nn.Linear(CAMERA_VECTOR_SIZE, channels)
     second = nn.Linear(channels, channels)
     return nn.Sequential(OrderedDict(fc1=first, relu=nn.ReLU(), fc2=second))
@@ -155,8 +155,10 @@ class CameraAwareDepthNet(nn.Module):
         """
         vectors = self.bn(camera_vectors)
         feats = self.reduce_conv(feats)
-        context = self.context_conv(self.context_se(feats, self.context_mlp(vectors)))
-        depth = self.depth_conv(self.depth_se(feats, self.depth_mlp(vectors)))
+        context_embedding = self.context_mlp(vectors)
+        context = self.context_conv(self.context_se(feats, context_embedding))
+        depth_embedding = self.depth_mlp(vectors)
+        depth = self.depth_conv(self.depth_se(feats, depth_embedding))
         return depth, context
 
 

@@ -13,11 +13,11 @@ from gsmap.structures.tensors import tensor_versions
 class FoldedBackbone:
     """Runs a backbone. In inference, it runs a copy with batch norms folded into convolutions.
 
-    With fixed statistics a batch norm is a scale and a shift per channel, so the weights of the
-    convolution before it can include them. The copy is made on first use and again after a weight
-    has changed. A call in training drops the copy. The backbone itself is unchanged, and so is
-    every checkpoint. Only ResNets are folded, because mmcv's function assumes that each norm
-    follows the convolution that was registered before it.
+    With fixed statistics, a batch norm is a scale and a shift per channel. The convolution before
+    the norm can include both in its weights. The copy is made on first use and again after a weight
+    has changed. A call in training deletes the copy. The backbone itself and its checkpoints do not
+    change. Only ResNets are folded, because mmcv's function assumes that each norm is applied right
+    after the convolution that was registered before it.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class FoldedBackbone:
 
 
 def can_be_folded(backbone: nn.Module) -> bool:
-    """Whether a folded copy would compute the output of the backbone in its present state."""
+    """Whether a folded copy would compute the output of the backbone in its current state."""
     if torch.is_grad_enabled() or torch.compiler.is_compiling():
         return False
     if not isinstance(backbone, ResNet):

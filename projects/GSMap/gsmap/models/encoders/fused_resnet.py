@@ -1,4 +1,4 @@
-"""ResNet on a GPU with each batch norm, residual and ReLU inside of its convolution."""
+"""ResNet whose convolutions include the batch norm, residual and ReLU after them, for a GPU."""
 
 from typing import Any, Protocol
 
@@ -39,11 +39,11 @@ class Convolve(Protocol):
 
 
 def fused_resnet(backbone: ResNet, images: Tensor, convolve: Convolve) -> tuple[Tensor, ...]:
-    """Feature maps of a ResNet of plain blocks (`is_plain`).
+    """Compute the feature maps of a ResNet of plain blocks (`is_plain`).
 
     Args:
         backbone: The ResNet.
-        images: Its input. (n, 3, H, W)
+        images: Input of the ResNet. (n, 3, H, W)
         convolve: Function that computes each convolution with its norm, residual and ReLU.
 
     Returns:
@@ -107,12 +107,12 @@ def convolve_folded(
 
 
 class FrozenNorms:
-    """Trains a ResNet whose batch norms have fixed statistics, as fused convolutions.
+    """Forward pass, with gradients, of a ResNet whose batch norms have fixed statistics.
 
     A norm with fixed statistics is a scale and a shift per channel. The scale multiplies the
-    weights of the convolution, with gradients, and the shift is its bias. Compared with separate
-    norms and ReLUs, most of the memory traffic of the backbone disappears. Weights of the
-    backbone, and so its checkpoints, are unchanged.
+    weights of the convolution, with gradients, and the shift is the bias of the convolution.
+    Compared with separate norms and ReLUs, this avoids most of the memory traffic of the backbone.
+    The weights of the backbone, and therefore its checkpoints, do not change.
     """
 
     def __init__(self) -> None:
@@ -123,7 +123,7 @@ class FrozenNorms:
         """Compute the feature maps of normalised images.
 
         Args:
-            backbone: The ResNet, which `has_frozen_norms`.
+            backbone: ResNet for which `has_frozen_norms` is True.
             images: Normalised images. (n, 3, H, W)
             dtype: Type in which the convolutions are computed.
 
@@ -153,9 +153,9 @@ class FrozenNorms:
 
     def _scale_and_shift(self, norm: Any) -> tuple[Tensor, Tensor]:
         """Scale and shift of a norm with fixed statistics. (C,) each"""
-        # A step that is recorded (as a CUDA graph) must contain the computation of both. Each
-        # replay then reads the tensors of the norm, into which a checkpoint may have been loaded
-        # since the recording.
+        # The recording of a step, a CUDA graph, must include the computation of scale and shift:
+        # a checkpoint may be loaded into the norm after the recording, and each replay must read
+        # its new tensors.
         if norm.weight.requires_grad or is_recording(norm.weight.device.type):
             return _scale_and_shift(norm)
         versions = tensor_versions(norm)
@@ -170,7 +170,7 @@ class FrozenNorms:
 
 
 def has_frozen_norms(backbone: nn.Module | None) -> bool:
-    """Whether `FrozenNorms` would compute the output of a backbone in its present state."""
+    """Whether `FrozenNorms` can replace the forward pass of a backbone in its present state."""
     if backbone is None or not is_plain(backbone) or torch.compiler.is_compiling():
         return False
     for module in backbone.modules():
@@ -188,7 +188,10 @@ def _scale_and_shift(norm: Any) -> tuple[Tensor, Tensor]:
 
 
 class _ConvolveReLU(torch.autograd.Function):
-    """Convolution, bias, optional residual and ReLU in one. Values before the ReLU are not kept."""
+    """Convolution, bias, optional residual and ReLU as one operation.
+
+    The values before the ReLU are not kept for the gradient.
+    """
 
     @staticmethod
     def forward(

@@ -54,7 +54,7 @@ class GeometryKernelAttention(nn.Module):
 
     offsets: Tensor
     # True for CUDA graphs, in which the sizes of tensors must not depend on values. All pairs of a
-    # cell and a camera are then computed, with weight 0 where the camera does not see the cell.
+    # cell and a camera are then computed, with weight 0 where the cell is not visible.
     fixed_sizes = False
 
     def __init__(
@@ -136,15 +136,15 @@ class GeometryKernelAttention(nn.Module):
             summed = self._sum_pairs(
                 value.float(), shape=shape, uv=projection.uv, pairs=pairs, weights=weights
             )
-        # Number of cameras that see a cell. Also with `released_cells`, each sample has separate
-        # numbers. (B, Q)
+        # Number of cameras in which a cell is visible. It is counted for each sample, even with
+        # `released_cells`. (B, Q)
         count = visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])
 
     def _sum_pairs(
         self, value: Tensor, shape: tuple[int, int], uv: Tensor, pairs: Tensor, weights: Tensor
     ) -> Tensor:
-        """Sum pixels of kernels over cameras, as `sample_kernels`, for the visible pairs only.
+        """Sum pixels of kernels over cameras like `sample_kernels`, but for visible pairs only.
 
         Args:
             value: Projected image features. (B, V, h * w, C)
@@ -169,7 +169,7 @@ class GeometryKernelAttention(nn.Module):
         )  # (T, heads, S)
         image = (sample * num_views + view).view(-1, 1, 1)
         head = torch.arange(self.num_heads, device=value.device).view(1, -1, 1)
-        # A row holds the channels of one head of one pixel of one image.
+        # A row has the channels of one head of one pixel of one image.
         value_rows = value.reshape(-1, value.shape[-1] // self.num_heads)
         row_index = (image * num_pixels + pixels) * self.num_heads + head  # (T, heads, S)
         pair_sums = sum_rows(value_rows, row_index, pair_weights).flatten(1)  # (T, C)

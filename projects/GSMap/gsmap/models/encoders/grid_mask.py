@@ -13,8 +13,8 @@ class GridMask(nn.Module):
     """GridMask augmentation (arXiv 2001.04086): a regular grid of black squares in all images.
 
     Args:
-        prob: Probability to mask a batch, in [0, 1].
-        ratio: Width of a visible stripe over the period of the grid, in (0, 1).
+        prob: Probability of masking a batch, in [0, 1].
+        ratio: Width of a visible stripe as a share of the period of the grid, in (0, 1).
 
     Raises:
         ValueError: If an argument is out of range.
@@ -46,5 +46,5 @@ class GridMask(nn.Module):
         row, col = torch.randint(period, (2,)).tolist()
         row_is_visible = (torch.arange(height) + row) % period < side
         column_is_visible = (torch.arange(width) + col) % period < side
-        # Only pixels outside of the visible rows and of the visible columns are in black squares.
+        # A pixel is in a black square if neither its row nor its column is visible.
         return (row_is_visible[:, None] | column_is_visible).float()

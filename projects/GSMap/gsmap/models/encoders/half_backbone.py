@@ -12,12 +12,12 @@ from gsmap.structures.tensors import tensor_versions
 
 
 class HalfBackbone:
-    """Runs copies of an image backbone and its neck with float16 weights, cast once.
+    """Runs copies of an image backbone and its neck whose weights were cast to float16 once.
 
-    These two do nearly all arithmetic of a frame. Autocast would cast every weight at each frame.
-    Batch norms of ResNets are folded in float32, before the cast. On a GPU, a convolution of a
-    ResNet block includes its bias, the residual and the ReLU (fused operators of cuDNN). The copies
-    are made on first use and again after a weight has changed.
+    Backbone and neck do nearly all arithmetic of a frame. Autocast would cast every weight again in
+    each frame. Batch norms of ResNets are folded in float32, before the cast. On a GPU, fused
+    operators of cuDNN compute each convolution of a ResNet block together with its bias, residual
+    and ReLU. The copies are made on first use and again after a weight has changed.
     """
 
     def __init__(self) -> None:

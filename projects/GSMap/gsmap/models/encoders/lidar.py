@@ -18,14 +18,14 @@ from gsmap.utils.errors import WorkError
 
 @MODELS.register_module()
 class LidarEncoder(BaseModule):
-    """BEV features of voxels: PointPillars or SECOND, depending on the configs of its modules.
+    """Encoder from LiDAR voxels to BEV features: PointPillars or SECOND, depending on its modules.
 
-    The data preprocessor makes the voxels (``voxel=True``), and the range of the voxels must be the
-    extent of the map.
+    The data preprocessor makes the voxels (``voxel=True``). Their range must be the extent of the
+    map.
 
     Args:
         grid: Extent of the map.
-        voxel_encoder: Config of the encoder of the points of a voxel.
+        voxel_encoder: Config of the module that encodes the points of each voxel.
         middle_encoder: Config of the module that scatters voxels to the BEV plane.
         backbone: Config of the 2D backbone, or None.
         neck: Config of the neck, or None; its first output is used.
@@ -55,8 +55,9 @@ class LidarEncoder(BaseModule):
         """Encode the voxels of a batch.
 
         Args:
-            voxels: ``voxels`` (M, points, channels), ``num_points`` (M,) and ``coors`` (M, 4), the
-                latter as sample, z, y, x.
+            voxels: ``voxels``, the points of each voxel (M, points, channels); ``num_points``, the
+                number of points of each voxel (M,); and ``coors``, the index of the sample and the
+                cell z, y, x of each voxel (M, 4).
             batch_size: Number B of samples.
 
         Returns:

@@ -20,10 +20,10 @@ CAMERA_MATRICES = ("cam2img", "img_aug_matrix", "ego_from_cam")
 
 @MODELS.register_module()
 class LSSEncoder(CameraEncoder):
-    """Lift image features by predicted depth, sum them in BEV cells, refine by convolutions.
+    """BEV encoder that lifts image features by predicted depth and sums them in BEV cells.
 
-    The features are summed in cells with half the side of the output's cells, and the second of the
-    three convolutions has stride 2.
+    Three convolutions refine the sums. The features are summed in cells with half the side of the
+    output's cells, and the second convolution has stride 2.
 
     Args:
         grid: Extent of the map; points outside are dropped.
@@ -31,8 +31,8 @@ class LSSEncoder(CameraEncoder):
         bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y.
         embed_dims: Channels C of image and BEV features.
         depth_range: ``(low, high, step)`` of the depth bins in metres.
-        camera_aware: Use the depth net with camera parameters. Otherwise one convolution,
-            as in the BEVPool variant of MapTR.
+        camera_aware: Whether the depth net uses the camera parameters. Otherwise, it is one
+            convolution, as in the BEVPool variant of MapTR.
         aspp_channels: Channels of each branch of the spatial pyramid (ASPP) in the camera-aware
             depth net.
         init_cfg: Initialisation config of mmengine.
@@ -136,7 +136,7 @@ class LSSEncoder(CameraEncoder):
         }
 
     def points(self, frame_from_img: Tensor, img_shape: tuple[int, int], feats: Tensor) -> Tensor:
-        """Points of every feature pixel at every depth, in the annotation frame.
+        """Compute the points of every feature pixel at every depth, in the annotation frame.
 
         Args:
             frame_from_img: Matrices from (u * d, v * d, d, 1) to metres. (B, V, 4, 4)

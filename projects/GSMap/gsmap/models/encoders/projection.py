@@ -1,4 +1,4 @@
-"""Projection of BEV pillars into the cameras, and of feature pixels to points above the BEV."""
+"""Projection of BEV pillars into the cameras, and of feature pixels to points in 3D."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ _MIN_DEPTH_M = 1e-5
 
 
 class PillarProjection(NamedTuple):
-    """Projection of the Z pillar points of all Q cells into V cameras.
+    """Projection of the Z points of the pillars of all Q cells into V cameras.
 
     Attributes:
         uv: Image coordinates, [0, 1] over the padded image; undefined behind a camera.
@@ -63,14 +63,14 @@ def project_pillars(
     """
     matrices = img_from_frame[:, :, None, None].float()
     x, y, z, _ = points.float()[..., None].unbind(-2)  # (Q, Z, 1) each
-    # On a GPU, a product of millions of small matrices takes ten times as long, and TF32 would
-    # move the projections by pixels.
+    # The product is written out. On a GPU, a product of millions of small matrices takes ten times
+    # as long, and TF32 would move the projections by pixels.
     projected = matrices[..., 0] * x + matrices[..., 1] * y + matrices[..., 2] * z
     return visible_points(projected + matrices[..., 3], img_shape)
 
 
 def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
-    """Normalised image coordinates and visibility of projected pillar points.
+    """Compute the normalised image coordinates and the visibility of projected pillar points.
 
     Args:
         projected: Points (u * d, v * d, d, ...), with pixels u, v and the depth d in metres.
@@ -87,10 +87,11 @@ def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProje
 def pixel_rays(
     frame_from_img: Tensor, image_size: tuple[int, int], feature_size: tuple[int, int]
 ) -> Tensor:
-    """Viewing rays of the feature pixels, as vectors to depth 1.
+    """Viewing rays of the feature pixels, as vectors from the camera to the depth of 1 m.
 
     Args:
-        frame_from_img: Matrices as in `frustum_points`. (..., 3 or 4, 3 or 4)
+        frame_from_img: Inverse projections as in `frustum_points`, of which the first three rows
+            and columns are used. (..., 3 or 4, 3 or 4)
         image_size: Height and width of the padded image in pixels.
         feature_size: Height h and width w of the feature map.
 

@@ -43,15 +43,16 @@ def _convolution(
 
 
 class OneShotAggregation(nn.Module):
-    """Chain of 3x3 convolutions. At the end, a 1x1 convolution joins the input and all outputs.
+    """Block of 3x3 convolutions, one after another, whose outputs a 1x1 convolution combines.
 
-    A gate weights the channels of the result (effective squeeze and excitation, eSE).
+    The 1x1 convolution also takes the input of the block. A gate weights the channels of its output
+    (effective squeeze and excitation, eSE).
 
     Args:
         name: Prefix of the names of the modules.
         channels: Number of channels of the input, of each 3x3 convolution and of the output.
         num_layers: Number of 3x3 convolutions.
-        residual: Add the input to the output.
+        residual: Whether to add the input of the block to its output.
     """
 
     def __init__(
@@ -85,7 +86,8 @@ class OneShotAggregation(nn.Module):
         for layer in self.layers:
             outputs.append(layer(outputs[-1]))
         aggregated = self.concat(torch.cat(outputs, dim=1))
-        gated = aggregated * self.ese(aggregated.mean((2, 3), keepdim=True))
+        channel_means = aggregated.mean((2, 3), keepdim=True)
+        gated = aggregated * self.ese(channel_means)
         if self.residual:
             return gated + feats
         return gated
@@ -97,11 +99,13 @@ class VoVNet(BaseModule):
 
     Args:
         depth: Size of the network: 19, 39, 57 or 99.
-        out_indices: Stages of the output: 0 to 3, at 1/4, 1/8, 1/16 and 1/32 of the image size.
-        frozen_stages: Number of stages that are not trained, 0 to 4, in addition to the stem; -1
-            trains the stem, too.
-        norm_eval: Keep the running statistics of batch norms in training.
-        init_cfg: Initialisation of mmengine.
+        out_indices: Indices of the stages whose features are returned. Stages 0 to 3 have 1/4, 1/8,
+            1/16 and 1/32 of the image size.
+        frozen_stages: Number of stages after the stem that are not trained, 0 to 4. The stem is not
+            trained either. With -1, the stem and all stages are trained.
+        norm_eval: Whether batch norms stay in evaluation mode in training, so that their running
+            statistics do not change.
+        init_cfg: Settings of mmengine for the initialisation.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -158,7 +162,7 @@ class VoVNet(BaseModule):
         return self.stage2, self.stage3, self.stage4, self.stage5
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Feature maps of the stages in ``out_indices``. (n, 3, H, W) -> tuple of (n, C, h, w)"""
+        """Compute the features of ``out_indices``. (n, 3, H, W) -> (n, C, h, w) of each stage"""
         feats = self.stem(images)
         outputs = []
         for index, stage in enumerate(self.stages):

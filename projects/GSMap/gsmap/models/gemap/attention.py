@@ -29,15 +29,15 @@ class _AttentionBlock(nn.Module):
 class GeometryDecoupledAttention(nn.Module):
     """Self-attention to the points of other instances, then within each instance (GeMap).
 
-    The result equals the released code's, which computes the second step as a masked attention
-    among all N * P points. Here it is an attention among P points per instance.
+    The released code computes the second step as a masked attention among all N * P points. Here it
+    is an attention among the P points of each instance, with an equal result.
 
     Args:
         embed_dims: Channels C.
         num_heads: Number of heads.
         num_points: Points P per instance.
         ffn_dims: Hidden channels of both feed-forward networks.
-        dropout: Probability to drop an attention weight in training.
+        dropout: Probability of dropping an attention weight in training.
     """
 
     def __init__(

@@ -15,8 +15,8 @@ from gsmap.models.gemap.losses import EuclideanLoss
 class GeMapHead(MapHead):
     """Map head with the modules of GeMap as defaults.
 
-    On a MapTR config this is GeMap with its simple objective, on a MapTRv2 config with its full
-    objective.
+    In a MapTR config this head makes GeMap with its simple objective, and in a MapTRv2 config GeMap
+    with its full objective.
 
     Args:
         decoder: Config of the decoder; its self-attention is replaced if ``decoupled``.
@@ -25,10 +25,11 @@ class GeMapHead(MapHead):
             is used.
         loss_euclidean: Settings of `EuclideanLoss`, which by default has its default values. With
             None, the head is trained without this loss.
-        decoupled: Use the self-attention of GeMap in the layers instead of the configured one.
-        one_to_many: Keep the further query groups, which GeMap does not have. The Euclidean loss of
-            their many matches takes much memory. To train a group without it, list the other losses
-            in ``losses`` of the group.
+        decoupled: Whether to use the self-attention of GeMap in the layers instead of the
+            configured one.
+        one_to_many: Whether to keep the query groups after the first one, which GeMap does not
+            have. The Euclidean loss of their many matches takes much memory. To train a group
+            without it, list the other losses in ``losses`` of the group.
         kwargs: Further arguments of `MapHead`.
     """
 

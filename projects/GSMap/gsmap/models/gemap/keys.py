@@ -1,4 +1,4 @@
-"""State keys of the released GeMap and their names here.
+"""Mapping between the state keys of the released GeMap and of this project.
 
 `rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
 Each word of the text continues both prefixes: ``released=here``, or one name for both.
@@ -18,8 +18,9 @@ from gsmap.models.maptr.keys import (
 )
 from gsmap.models.maptrv2.keys import LIFTED_MARKER, LIFTED_RULES, LIFTED_UNUSED
 
-# Names of the release since 2023-12-12. Before that date, "intra" was the attention between
-# instances and "inter" the one within each instance; no key distinguishes the two versions.
+# The names have the meaning of releases since 2023-12-12. Before that date, "intra" was the
+# attention between instances and "inter" the attention within each instance. The keys do not show
+# which version a checkpoint has.
 _GEOMETRY_RULES = rules_of(
     DECODER_LAYER + "attentions.0.", LAYER + "self_attn.", "inter_=inter. intra_=intra."
 )
@@ -28,8 +29,8 @@ GEMAP = KeyMap(
     (*_GEOMETRY_RULES, *MAPTR.rules),
     unused={
         **CODE_WEIGHTS,
-        # Buffers of the full objective. The released model of Argoverse 2 has them, too: its simple
-        # objective is the full one, with weights of zero for the further losses.
+        # Buffers of the full objective. The released model of Argoverse 2 also has them. Its simple
+        # objective is the full objective with zero weights for the additional losses.
         HEAD + "tau": None,  # not used in any computation
         HEAD + "loss_seg.loss_fn.pos_weight": None,
         HEAD + "loss_pv_seg.loss_fn.pos_weight": None,

@@ -1,8 +1,8 @@
 """Euclidean loss of GeMap (arXiv 2312.03341): shapes of map elements and relations between them.
 
-Angles enter by cosine and sine, which do not wrap around. Two details follow the released code:
-coordinates are normalised to [0, 1], so x and y weigh differently; and every element, including
-open lines, has an edge from its last point to its first.
+Angles are compared by their cosine and sine, which do not jump where the angle wraps around. Two
+details follow the released code: coordinates are normalised to [0, 1], so x and y weigh
+differently; and every element, including open lines, has an edge from its last point to its first.
 """
 
 from collections.abc import Sequence
@@ -72,7 +72,8 @@ def euclidean_shape_loss(pred: Tensor, target: Tensor) -> Tensor:
     """
     check_same_shape(pred=pred, target=target)
     distances = (shape_features(pred) - shape_features(target)).abs().sum(0)  # (..., M, P)
-    return distances.sum((-2, -1)) / max(pred.shape[-3] * pred.shape[-2], 1)
+    num_points = pred.shape[-3] * pred.shape[-2]
+    return distances.sum((-2, -1)) / max(num_points, 1)
 
 
 def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int]) -> Tensor:
@@ -140,11 +141,12 @@ class EuclideanLoss(MapLoss):
 
     def by_layer(self, pairs: MatchedPairs) -> Tensor:
         """Weighted loss of each decoder layer. Heights are ignored."""
-        # The M pairs lie layer after layer, and the L layers have equally many pairs.
+        # The M pairs are ordered by decoder layer, and each of the L layers has equally many pairs.
         pred = pairs.by_layer(pairs.pred_pts[..., :2])  # (L, M / L, P, 2)
         target = pairs.by_layer(pairs.gt_pts[..., :2])
         shape = euclidean_shape_loss(pred, target)
-        # `pairs.counts` repeats the counts of the samples for every layer. One layer is enough.
+        # `pairs.counts` repeats the number of pairs of each sample for every layer. The counts of
+        # one layer are enough.
         num_samples = len(pairs.counts) // pairs.num_layers
         counts = pairs.counts[:num_samples]
         relation = euclidean_relation_loss(pred, target, counts)

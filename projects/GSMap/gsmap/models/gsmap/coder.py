@@ -14,9 +14,9 @@ class GaussianCoder(MapCoder):
 
     Args:
         grid: Extent of the map.
-        sigma_power: Exponent >= 0. The odds of a score are divided by sigma to this power. Here
-            sigma is the smaller of the two sigmas of a point in metres, averaged geometrically over
-            the points of the element.
+        sigma_power: Exponent >= 0. The odds of a score are divided by sigma to this power, where
+            sigma is the geometric mean over the points of the element of each point's smaller
+            sigma, in metres.
         kwargs: Further arguments of `MapCoder`.
 
     Raises:

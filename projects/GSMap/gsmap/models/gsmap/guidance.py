@@ -15,9 +15,9 @@ from gsmap.utils.errors import InputError
 class GaussianGuidance(Guidance, AddsWeights):
     """Conditioning of a decoder layer on the Gaussians of its queries, for any attention.
 
-    It starts without effect, so that a layer with the weights of MapTR has the output of MapTR.
-    `init_weights` sets the last layer of the embedding to zero. The matrices of the offsets are
-    identities for the Gaussians that a decoder starts from (`GaussianSpace.frames`).
+    Before training it has no effect, so a layer with the weights of MapTR has the output of MapTR:
+    `init_weights` sets the last layer of the embedding to zero, and the matrices of the offsets are
+    identities for the initial Gaussians of a decoder (`GaussianSpace.frames`).
 
     Args:
         space: Encoding of Gaussians in references.
@@ -76,11 +76,12 @@ class GaussianGuidance(Guidance, AddsWeights):
 
         Args:
             reference: References. (B, Q, D)
-            feats: Sampled feature map (B, C, H, W), or several maps. Offsets are in cells of the
-                first map.
+            feats: Feature map that is sampled (B, C, H, W), or several maps. Offsets are in cells
+                of the first map.
 
         Returns:
-            Matrices that multiply offsets (x, y) in cells from the left, or None. (B, Q, 2, 2)
+            Matrices that multiply offsets (x, y) in cells from the left; None without ``sampling``.
+            (B, Q, 2, 2)
         """
         if not self.sampling:
             return None

@@ -36,14 +36,14 @@ class GSMapHead(MapHead):
     """Map head with the parts of GSMap as defaults, for any decoder and losses.
 
     References are Gaussians (GSMap Eq. 1), on which the decoder layers are conditioned. Matching
-    has the IoU cost of rendered masks (Eq. 9), and training the raster loss (Eqs. 10 and 12).
-    Prediction does not render.
+    includes the IoU cost of rendered masks (Eq. 9), and training includes the raster loss (Eqs. 10
+    and 12). Prediction does not render masks.
 
     Args:
         grid: Extent of the map.
         decoder: Config of the decoder.
-        losses: Configs of the other losses.
-        match_costs: Configs of the other matching costs.
+        losses: Configs of the losses other than ``loss_raster``.
+        match_costs: Configs of the matching costs other than ``iou_cost``.
         loss_raster: Settings of the loss of rendered masks, by default `RasterLoss`. None trains
             without it.
         iou_cost: Settings of the matching cost of rendered masks, by default `IoUCost` with weight
@@ -53,8 +53,8 @@ class GSMapHead(MapHead):
         masks: Settings of `GaussianMasks`.
         reference: Settings of `GaussianReference`. The default of the smallest sigma is half a
             pixel of the masks.
-        temperatures: Factors > 0 of the sigmas of detections along and across the line, two for
-            each class, or None. `tools/calibrate.py` fits them.
+        temperatures: Two factors > 0 for each class, by which the sigmas of detections along and
+            across the line are multiplied, or None. `tools/calibrate.py` fits them.
         kwargs: Further arguments of `MapHead`.
 
     Raises:

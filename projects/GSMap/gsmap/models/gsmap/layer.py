@@ -11,12 +11,15 @@ from gsmap.models.gsmap.guidance import GaussianGuidance
 
 @MODELS.register_module()
 class GaussianDecoderLayer(MapDecoderLayer):
-    """Decoder layer conditioned on the Gaussians of its queries, with attention of any class.
+    """Decoder layer conditioned on the Gaussians of its queries.
 
     Args:
-        guide_sampling: Transform sampling offsets by the orientation and size of each Gaussian.
-        embed_gaussians: Add an embedding of (mu, sigma, theta) to the positional queries.
-        invariant_frame: Transform offsets by matrices that are equal for theta and theta + pi.
+        guide_sampling: Whether to transform sampling offsets by the orientation and size of each
+            Gaussian.
+        embed_gaussians: Whether to add an embedding of (mu, sigma, theta) to the positional
+            queries.
+        invariant_frame: Whether to transform offsets by matrices that are equal for theta and
+            theta + pi.
         embed_hidden_dims: Hidden channels of the embedding.
         kwargs: Arguments of `MapDecoderLayer`.
     """

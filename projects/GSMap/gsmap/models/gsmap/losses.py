@@ -23,8 +23,9 @@ class MaskLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss, or a weight for each class.
-        full_iou: Smallest soft IoU at which a pair has the full loss, or one for each class. Below
-            it, the loss is multiplied by IoU / full_iou. With 0, all pairs have the full loss.
+        full_iou: Smallest soft IoU at which a pair has the full loss, or a value for each class.
+            Below it, the loss is multiplied by IoU / full_iou. With 0, all pairs have the full
+            loss.
         flags: Flags of `MapLoss`.
     """
 

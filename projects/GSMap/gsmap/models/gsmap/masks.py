@@ -19,7 +19,7 @@ class GaussianMasks(ElementMasks):
 
     Args:
         grid: Extent of the map.
-        held_classes: Class indices of elements whose masks have no gradient in the points, only in
+        held_classes: Class indices of elements whose masks pass no gradient to the points, only to
             sigma and theta.
         kwargs: Settings of `ElementMasks`. ``source="gaussians"`` is like ``"points"``, but the
             mask of the ground truth is rendered from Gaussians along its points (GSMap Eq. 6). The
@@ -59,10 +59,10 @@ class GaussianMasks(ElementMasks):
         )
 
     def rendered_references(self, references: Tensor, labels: Tensor, coords: int) -> Tensor:
-        """References for the rendering, whose points have no gradient for ``held_classes``.
+        """Prepare references for rendering: points of ``held_classes`` are detached.
 
         Args:
-            references: Predicted vertices of the decoder: ``coords`` coordinates, then the other
+            references: Vertices that the decoder predicts: ``coords`` coordinates, then the other
                 parameters of the Gaussian. (M, P, D)
             labels: Class indices of their ground truths. (M,)
             coords: Number of coordinates of a point.

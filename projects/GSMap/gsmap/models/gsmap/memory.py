@@ -1,6 +1,6 @@
 """Memory of Gaussians: transformation to the next frame, refinement, and fusion.
 
-This is not in the paper. The published memory of queries propagates points.
+The memory of Gaussians is not in the paper. The published memory of queries propagates points.
 """
 
 import math
@@ -22,14 +22,14 @@ COVARIANCES = ("points", "moved", "fused")
 
 @MODELS.register_module()
 class GaussianMemory(QueryMemory):
-    """Memory of queries of a head with Gaussians.
+    """Query memory for a head with Gaussians, which also propagates the Gaussians.
 
     Args:
         embed_dims: Channels C of the queries.
         covariance: Propagation of the Gaussians. ``"points"`` propagates only the centres, and each
             query starts with the initial Gaussian. ``"moved"`` transforms the Gaussians with the
             motion of the vehicle and adds the noise. ``"fused"`` also fuses the refined Gaussians
-            with the transformed ones (`fuse_gaussians`), point by point in their order.
+            with the transformed Gaussians of equal point index (`fuse_gaussians`).
         noise_m: Standard deviation of the drift of a Gaussian after one second, in metres. The
             variance grows linearly with time.
         noise_deg: Standard deviation of the drift of the heading after one second, in degrees.

@@ -32,8 +32,8 @@ class GaussianReference(PointReference, AddsWeights):
         grid: Extent of the map.
         embed_dims: Channels C of the point states.
         num_layers: Number of decoder layers.
-        mlp: Predict sigma and theta by networks like the networks of the points (GSMap Eq. 8)
-            instead of one linear layer each.
+        mlp: Whether sigma and theta are predicted by MLPs, as the points are (GSMap Eq. 8), instead
+            of one linear layer per decoder layer.
         coords: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
         points_per_state: Number of points n that one query initialises and one state refines.
@@ -81,7 +81,7 @@ class GaussianReference(PointReference, AddsWeights):
         self.reset_gaussian_parts()
 
     def reset_gaussian_parts(self) -> None:
-        """Make the Gaussians of all queries equal, and their changes by the layers 0."""
+        """Set weights so that all queries start with equal Gaussians and layers keep them."""
         constant_init(self.gaussian_init, 0.0)
         for branch in self.gaussian_branches:
             *_, last = branch.children()
@@ -127,7 +127,7 @@ class GaussianReference(PointReference, AddsWeights):
         return torch.cat([transformed[..., :-1], theta], dim=-1)
 
     def errors(self, references: Tensor) -> Gaussians:
-        """Gaussians that describe the errors of points. Here they are the rendered Gaussians.
+        """Gaussians that describe the errors of points. They are equal to the rendered Gaussians.
 
         Args:
             references: References. (..., P, D)

@@ -22,7 +22,7 @@ from gsmap.structures.gaussians import (
 )
 from gsmap.structures.grid import BEVGrid
 
-GAUSSIAN_FEATURES = 6  # size of `GaussianSpace.describe`
+GAUSSIAN_FEATURES = 6  # number of features that `GaussianSpace.describe` returns
 
 
 @MODELS.register_module()
@@ -51,8 +51,8 @@ class ErrorReference(GaussianReference):
     def __init__(self, grid: BEVGrid, embed_dims: int = 256, **kwargs: Any) -> None:
         super().__init__(grid, embed_dims, **kwargs)
         self.error_space = GaussianSpace(grid, min_scale_m=0.05, max_scale_m=20.0, activation="exp")
-        # Predictions carry the smallest sigma, here the 0.05 m, so that an evaluation can count the
-        # Gaussians whose sigmas are close to it.
+        # The metainfo of predictions contains the smallest sigma, here 0.05 m, so that an
+        # evaluation can count the Gaussians whose sigmas are close to it.
         self.metainfo = {"min_scale_m": self.error_space.floor_m}
         self.error_branches = nn.ModuleList(
             layers.mlp(embed_dims + GAUSSIAN_FEATURES, embed_dims, 2) for _ in self.branches
@@ -65,7 +65,7 @@ class ErrorReference(GaussianReference):
         self.reset_errors()
 
     def reset_errors(self) -> None:
-        """Set the sigmas of all errors to one value, whatever the input."""
+        """Set the sigmas of all errors to one value, independent of the input."""
         for branch in self.error_branches:
             constant_init(cast(nn.Sequential, branch)[-1], 0.0)
 
@@ -95,7 +95,7 @@ class ErrorReference(GaussianReference):
         return self._with_errors(refined, errors.to(refined))
 
     def _with_errors(self, reference: Tensor, errors: Tensor) -> Tensor:
-        """Insert sigmas before the Gaussian. (..., D - 2), (..., 2) -> (..., D)"""
+        """Insert sigmas of the error before the Gaussian. (..., D - 2), (..., 2) -> (..., D)"""
         return torch.cat([reference[..., :-3], errors, reference[..., -3:]], dim=-1)
 
     def errors(self, references: Tensor) -> Gaussians:

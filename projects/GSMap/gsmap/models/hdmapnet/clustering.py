@@ -1,4 +1,4 @@
-"""DBSCAN of many points that lie close together, with little memory."""
+"""DBSCAN that needs little memory for many points that lie close together."""
 
 import numpy as np
 from numba import njit
@@ -57,9 +57,9 @@ def _clusters(
 
     Args:
         points: Sorted points. (E, n)
-        seeds: Points in the order in which clusters start from them. (n,)
-        low: First candidate neighbour of each point: along the first axis, it is not more than the
-            largest distance away. (n,)
+        seeds: Indices of the points, in the order in which clusters start from them. (n,)
+        low: Index of the first candidate neighbour of each point. Candidates are the points within
+            the largest distance along the first axis. (n,)
         high: End (exclusive) of the candidate neighbours of each point. (n,)
         eps2: Largest squared distance of two neighbours.
         min_neighbours: Smallest number of neighbours of a core point, itself included.
@@ -73,8 +73,8 @@ def _clusters(
         is_core[i] = _is_core(points, i, low[i], high[i], eps2, min_neighbours)
     labels = np.full(count, _NOISE)
     stack = np.empty(count, np.int64)  # points whose neighbours are still to be visited
-    # Jumps from each point towards the next unlabelled one. An unlabelled point jumps to itself, as
-    # does the last entry, which stands for the end of the points.
+    # Following the entries from a point leads to the next unlabelled point. The entry of an
+    # unlabelled point is the point itself. The last entry, the end of the points, is also itself.
     unlabelled = np.arange(count + 1)
     num_clusters = 0
     for seed in seeds:
@@ -104,7 +104,7 @@ def _clusters(
 def _is_core(
     points: Points, point: int, low: int, high: int, eps2: float, min_neighbours: int
 ) -> bool:
-    """Check whether a point has enough neighbours; candidates are tested from the nearest on."""
+    """Check whether a point has enough neighbours, beginning with the candidates next to it."""
     number = 1  # the point itself
     for step in range(1, max(point - low, high - 1 - point) + 1):
         if point - step >= low:
@@ -129,7 +129,7 @@ def _are_neighbours(points: Points, i: int, j: int, eps2: float) -> bool:
 
 @njit(cache=True)
 def _follow_jumps(jumps: Indices, start: int) -> int:
-    """Return the end of the jumps from a point, and let all of them lead to the end directly."""
+    """Follow jumps to their end and return it; then let each of these jumps lead to the end."""
     end = start
     while jumps[end] != end:
         end = jumps[end]

@@ -99,8 +99,8 @@ class LineMapDecoder(nn.Module):
         """Predict at the resolution of the BEV features. (B, C, H, W) -> (B, ..., H, W) each"""
         first, _, last = self.stage_maps(bev_feats)
         # Each block joins the maps of the first and the last stage. The first block is for the
-        # classes and the second one for the embeddings. The last one, which is the second or a
-        # third one, is for the directions.
+        # classes, the second for the embeddings, and the last for the directions. With a shared
+        # block, the last block is the second one.
         blocks = [block(first, last) for block in self.joined]
         semantic_branch, embedding_branch, direction_branch = self.maps
         return LineMaps(

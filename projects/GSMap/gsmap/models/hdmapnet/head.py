@@ -24,13 +24,13 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class HDMapNetHead(DetectionHead):
-    """Head that segments BEV features, clusters the pixels to elements and traces their lines.
+    """Head that segments BEV features, clusters the pixels into elements and traces their lines.
 
     Args:
         grid: Extent of the map, in metres.
         classes: Names of the classes.
-        embed_dims: Channels C of the BEV features. Features of another size than the raster are
-            resized.
+        embed_dims: Channels C of the BEV features. Features with other rows and columns than the
+            raster are resized.
         pixel_m: Side of a pixel in metres, as in `MakeLineMaps`.
         embedding_dims: Channels E of the instance embedding.
         num_directions: Number K of line directions, as in `MakeLineMaps`; a divisor of 360.
@@ -98,7 +98,7 @@ class HDMapNetHead(DetectionHead):
         return {"pixel_m": settings["pixel_m"], "num_directions": settings["num_directions"]}
 
     def forward(self, bev_outputs: Tensors) -> LineMaps:
-        """Predict maps of all pixels from ``bev_feats``. (B, C, H, W)
+        """Predict maps of all pixels from the features ``bev_feats`` (B, C, H, W).
 
         Rows of the predicted maps go from right to left, and columns from rear to front.
         """
@@ -134,7 +134,7 @@ class HDMapNetHead(DetectionHead):
             )
 
     def target(self, sample: Det3DDataSample, name: str) -> Tensor:
-        """Return a target of a sample.
+        """Return a target of a sample, after a check that it fits the head.
 
         Args:
             sample: Training sample.
@@ -178,7 +178,7 @@ class HDMapNetHead(DetectionHead):
         """
         maps = self(bev_outputs)
         results = []
-        # The three maps have the axis of the samples first.
+        # The first axis of each of the three maps is the sample.
         for semantic, embedding, direction in zip(*maps, strict=True):
             results.append(self.lines(LineMaps(semantic, embedding, direction=direction)))
         return results

@@ -36,8 +36,8 @@ HDMAPNET = KeyMap(
     ),
     unused={
         **unused_classifier(_TRUNK),
-        # The release has a first block of the directions, but never calls it: the directions use
-        # the block of the embeddings. Conversion to the release writes zeros of these shapes.
+        # The release has a first block for the directions, but never calls it and uses the block of
+        # the embeddings instead. Conversion to the release writes zeros of these shapes.
         **zeros(
             f"{_BEV}up1_direction.conv.",
             {

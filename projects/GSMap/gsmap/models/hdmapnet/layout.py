@@ -17,7 +17,7 @@ def forward_size(grid: BEVGrid) -> tuple[int, int]:
 
 
 def orient_forward(feats: Tensor, grid: BEVGrid) -> Tensor:
-    """Rotate a map with row 0 at the smallest y to this layout.
+    """Rotate BEV features, whose row 0 is at the smallest y, to HDMapNet's layout.
 
     (..., H, W) -> (..., rows, columns)
     """
@@ -30,7 +30,7 @@ def orient_forward(feats: Tensor, grid: BEVGrid) -> Tensor:
 def pixels_from_metres(points: NDArray[Any], grid: BEVGrid) -> NDArray[np.float64]:
     """Convert points (x, y) in metres to continuous pixels (column, row). (..., 2) -> (..., 2)
 
-    The centre of pixel (0, 0) is at (0.5, 0.5).
+    Pixels are in HDMapNet's layout. The centre of pixel (0, 0) is at (0.5, 0.5).
     """
     low = np.array([grid.x_range[0], grid.y_range[0]])
     scale = np.array([grid.width, grid.height]) / np.array(grid.extent_m)

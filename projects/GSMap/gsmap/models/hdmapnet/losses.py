@@ -17,12 +17,12 @@ class LineMapLosses:
 
     Args:
         semantic: Weight of the classification loss, a binary cross-entropy.
-        pull: Weight of the distance of an instance's pixels from its mean embedding.
-        push: Weight of the proximity of different instances' mean embeddings.
+        pull: Weight of the pull loss: distances of the embeddings of an instance from their mean.
+        push: Weight of the push loss: proximity of the mean embeddings of different instances.
         direction: Weight of the direction loss, a binary cross-entropy.
         pos_weight: Weight of positive pixels in the classification loss.
-        pull_margin: Distance from the mean embedding below which the pull loss is 0.
-        push_margin: Distance of two mean embeddings above which the push loss is 0.
+        pull_margin: Distance from the mean embedding up to which the pull loss is 0.
+        push_margin: Distance of two mean embeddings from which the push loss is 0.
 
     Raises:
         ValueError: If a setting is negative.
@@ -47,9 +47,9 @@ class LineMapLosses:
         Args:
             maps: Predictions of a batch.
             numbers: Instance number of each pixel in each class, 0 for none. No two instances of a
-                sample have the same number, also if their classes differ. (B, classes, H, W)
-            directions: Index, 1 to K, of the forward and of the backward direction of each pixel, 0
-                for none. (B, 2, H, W)
+                sample have the same number, even if their classes differ. (B, classes, H, W)
+            directions: Index, 1 to K, of the forward and of the backward direction of the line at
+                each pixel, 0 for no line. (B, 2, H, W)
 
         Returns:
             ``loss_semantic``, ``loss_pull``, ``loss_push`` and ``loss_direction``.
@@ -80,7 +80,7 @@ class LineMapLosses:
         """Compute the pull loss and the push loss of one sample.
 
         The losses follow De Brabandere et al., 2017, Eqs. 1 and 2, but the push loss is half of the
-        mean over unordered pairs of instances. Both losses are 0 without an instance.
+        mean over unordered pairs of instances. Both losses are 0 if there is no instance.
 
         Args:
             embedding: Instance embeddings. (E, H, W)

@@ -1,4 +1,4 @@
-"""HDMapNet's targets: the element and the two directions of each pixel."""
+"""HDMapNet's targets: the number of the line at each pixel, and its two directions."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,19 +26,19 @@ Pixels = NDArray[np.int32]
 class MakeLineMaps(BaseTransform):
     """Add rasters of the elements, ``gt_lines`` and ``gt_directions``, from ``map_instances``.
 
-    ``gt_lines`` (classes, H, W) holds the number of the line at each pixel, or 0 without a line.
-    The lines of a sample are numbered from 1, through all classes. ``gt_directions`` (2, H, W)
-    holds the forward and the backward direction of the line, 1 to K, or 0 without a line. Rows lie
-    from right to left, columns from rear to front.
+    ``gt_lines`` (classes, H, W) contains the number of the line at each pixel, or 0 without a line.
+    The lines of a sample are numbered from 1 across all classes. ``gt_directions`` (2, H, W)
+    contains the forward and the backward direction of the line, from 1 to K, or 0 without a line.
+    The first row is at the right of the vehicle, and the first column at the rear.
 
     Args:
         num_classes: Number of classes.
         pixel_m: Side of a pixel in metres. Configs set ``pixel_m`` of the head, and the head's
-            `target_settings` set it here.
+            `target_settings` copy it to this transform.
         thickness_px: Width of the lines, in pixels.
         gap_px: Width around a line in which lines of earlier classes are erased, in pixels.
         step_m: Distance at which lines are sampled before they are drawn, in metres.
-        num_directions: Number K of directions, a divisor of 360, set by the head like ``pixel_m``.
+        num_directions: Number K of directions, a divisor of 360. It is copied like ``pixel_m``.
         forward: Axis of the direction of travel, by default the longer side, as in `BEVGrid`.
 
     Raises:
@@ -134,8 +134,8 @@ class MakeLineMaps(BaseTransform):
                     f"label {element.label} of an element, but num_classes={self.num_classes} in "
                     "MakeLineMaps."
                 )
-            # As in the released code, sampling drops the last point of each line, and lines that
-            # are shorter than one step.
+            # As in the released code, the samples do not include the last point of a line, so a
+            # line that is shorter than one step is dropped.
             points = points_at_steps(element.points[:, :2].astype(np.float64), self.step_m)
             for part in parts_inside(points, grid.x_range, y_range=grid.y_range):
                 yield element.label, pixels_from_metres(part, grid).astype(np.int32)

@@ -29,11 +29,11 @@ class VectorizeConfig:
     """Settings of `vectorize`, by default as in the released code.
 
     Args:
-        min_area_px: Components of a class up to this area are removed, in pixels, >= 0.
+        min_area_px: Largest area of the components of a class that are removed, in pixels, >= 0.
         eps: Largest distance of two neighbours in the standardised embedding space.
         min_neighbours: Smallest number of neighbours of a cluster's core pixel, itself included.
-        ridge_tolerance: Largest difference of a ridge pixel's probability from the largest
-            probability beside it.
+        ridge_tolerance: Bound of the difference between the probability of a ridge pixel and the
+            largest probability across the line.
         step_px: Length of a step along the direction, in pixels.
         jump_px: Largest distance of the next point from the end of a step, in pixels.
         degrees: Angle between neighbouring directions, in degrees.
@@ -95,7 +95,7 @@ def vectorize(
     config = config or VectorizeConfig()
     _check(semantic, embedding, direction=direction, config=config)
     probs = semantic.detach().cpu().float().softmax(dim=0).numpy()
-    best = probs.argmax(axis=0)
+    best = probs.argmax(axis=0)  # most probable class of each pixel, 0 for the background. (H, W)
     embeddings = embedding.detach().cpu().float().numpy()
     direction = direction.detach().cpu()
     directions = np.full((*best.shape, 2), fill_value=NONE)
@@ -104,6 +104,7 @@ def vectorize(
         mask = clean_mask(best == label, config.min_area_px)
         clusters = cluster_pixels(mask, embeddings, config=config)
         ridge = ridge_pixels(np.where(clusters > 0, probs[label], 0), config.ridge_tolerance)
+        # Only ridge pixels can become points of lines, so other pixels need no directions.
         directions[ridge] = top_directions(direction[:, from_numpy(ridge)])
         for number in range(1, clusters.max() + 1):
             cluster = clusters == number
@@ -201,7 +202,8 @@ def cluster_pixels(mask: BoolArray, embedding: FloatArray, config: VectorizeConf
         config: Settings ``eps`` and ``min_neighbours`` of the clusters.
 
     Returns:
-        Cluster number of each pixel, from 1 on in the order of rows; 0 for none. (H, W)
+        Cluster number of each pixel, from 1 on in the order of the clusters' first core pixels, row
+        by row; 0 for none. (H, W)
     """
     from sklearn.preprocessing import StandardScaler  # the import takes a second
 
@@ -216,9 +218,9 @@ def cluster_pixels(mask: BoolArray, embedding: FloatArray, config: VectorizeConf
 def ridge_pixels(probs: FloatArray, tolerance: float) -> BoolArray:
     """Find the pixels with the largest probability across their line.
 
-    A line counts as vertical where the mean over 9 rows and 5 columns exceeds the mean over 5 rows
-    and 9 columns. A ridge pixel has the largest probability among 5 pixels: of its row if the line
-    is vertical there, otherwise of its column.
+    At a pixel, a line is vertical if the mean probability of the surrounding 9 rows and 5 columns
+    exceeds the mean of 5 rows and 9 columns. A ridge pixel has the largest probability of 5 pixels,
+    in its row if the line is vertical, otherwise in its column.
 
     Args:
         probs: Probability of a class, 0 outside its clusters. (H, W)
@@ -279,12 +281,12 @@ def sort_along_longer_side(cluster: BoolArray, ridge: BoolArray) -> IntArray:
 
 
 def order_by_distance(points: IntArray) -> IntArray:
-    """Order points greedily by the distance from their predecessor, starting with the first one.
+    """Order points greedily: the first point is followed by its nearest point, and so on.
 
-    A point more than 3 px from its predecessor, but less than 5 px from any of the ordered points,
-    belongs to a section that is already covered and is dropped. The predecessor is one of these
-    points, so a gap of 3 to 5 px always drops the point. After nine tenths of the points, a gap of
-    more than 10 px ends the line.
+    A point that is more than 3 px from its predecessor, but less than 5 px from one of the ordered
+    points, is dropped, because its section is already covered. (The predecessor is also one of the
+    ordered points, so a gap between 3 and 5 px always drops the point.) After nine tenths of the
+    points, a gap of more than 10 px ends the line.
 
     Args:
         points: Pixels. (n, 2)
@@ -346,7 +348,7 @@ def trace(points: IntArray, directions: IntArray, start: int, config: VectorizeC
     is_used = np.zeros(directions.shape, dtype=bool)
     line = [points[start]]
     line.extend(_walk(line[-1], points, directions, is_used=is_used, config=config))
-    line.reverse()  # now it ends at the start, from which the second walk goes on
+    line.reverse()  # the last point is now the start, and the second walk begins there
     line.extend(_walk(line[-1], points, directions, is_used=is_used, config=config))
     return np.stack(line)
 
@@ -358,7 +360,7 @@ def _walk(
     is_used: BoolArray,
     config: VectorizeConfig,
 ) -> Iterator[IntArray]:
-    """Yield the points after the last one, and mark their directions as used in place."""
+    """Yield the points that follow a point, and mark their directions as used in ``is_used``."""
     remaining = points
     while True:
         # Each round uses up a direction of the last point, with or without a step to a new point.

@@ -28,7 +28,10 @@ _LAYER = {
 
 @MODELS.register_module()
 class PriorBEVFusion(BaseModule):
-    """Add a BEV layer where the map is known, append the map, and apply a convolution (HRMapNet).
+    """Fuses BEV features with the map of earlier frames (HRMapNet).
+
+    The output of a BEV layer is added to the features where the map is known. Then the map is
+    appended to the channels, and a convolution is applied.
 
     Args:
         grid: Extent and cells of the BEV features, H rows and W columns.
@@ -38,9 +41,9 @@ class PriorBEVFusion(BaseModule):
         layer: Settings of the BEV layer, a `BEVQueryEncoder`. They replace the defaults in
             ``_LAYER``. None leaves the layer out.
         z_range: Lowest and highest z of the pillars of the layer, in metres.
-        residual: Add the result to the features through a 1 x 1 convolution, whose weights start
-            at 0. A model that was trained without a map then keeps its features. False replaces
-            the features, as published.
+        residual: Whether the result is added to the features through a 1 x 1 convolution, whose
+            weights start at 0. A model that was trained without a map then starts with unchanged
+            features. If False, the result replaces the features, as published.
     """
 
     def __init__(
@@ -73,9 +76,9 @@ class PriorBEVFusion(BaseModule):
         return () if self.layer is None else self.layer.calibration
 
     def init_weights(self) -> None:
-        """Initialise kernels from Xavier's uniform distribution, and the BEV layer.
+        """Initialise the BEV layer, and the convolution from Xavier's uniform distribution.
 
-        The weights of the residual are set to 0.
+        The weights of the residual convolution are set to 0.
         """
         super().init_weights()
         init_matrices(self.conv)

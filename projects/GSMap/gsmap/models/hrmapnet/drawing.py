@@ -18,10 +18,10 @@ def draw_elements(
     softness: float = 2.0,
     released_pixels: bool = False,
 ) -> Tensor:
-    """Draw elements softly, one channel per class.
+    """Draw elements with soft edges, in one channel per class.
 
-    A pixel with the squared distance D from a line, in squared pixels, takes the value
-    exp(-D / softness). Areas are filled. Of several elements of a class, the largest value counts.
+    The value of a pixel is exp(-D / softness), where D is its squared distance from a line, in
+    squared pixels. Areas are filled. Where elements of a class overlap, the largest value is used.
 
     Args:
         points_m: Points of the elements in metres. (n, P, 2)
@@ -29,7 +29,7 @@ def draw_elements(
         grid: Extent and cells of the raster, H rows and W columns.
         classes: Names of the classes.
         areas: Names of the classes whose elements are filled.
-        softness: Softness in squared pixels, > 0.
+        softness: Divisor of the squared distances, in squared pixels, > 0.
         released_pixels: Sample each pixel at its lower corner, as the released code of HRMapNet
             does, and not at its centre.
 

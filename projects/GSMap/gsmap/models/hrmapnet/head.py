@@ -40,7 +40,7 @@ class ContentDecoder(MapDecoder):
             bev_feats: BEV features. (B, C, H, W)
             refine: Refinement of the references after each layer.
             attn_mask: True where an instance may not attend to another, or None. (N, N)
-            between: Change of the queries between layers, or None.
+            between: Function that changes the queries between layers, or None.
 
         Returns:
             The output of every layer.
@@ -90,7 +90,7 @@ class HRMapNetHead(MapHead):
         reference.initial = mlp(embed_dims, embed_dims, embed_dims, out_dims)
 
     def init_weights(self) -> None:
-        """Initialise as `MapHead`, and the network of the first references (Xavier)."""
+        """Initialise the head as `MapHead` does, and the network of the first references."""
         super().init_weights()
         reference: Any = self.reference
         init_matrices(reference.initial)
@@ -99,8 +99,8 @@ class HRMapNetHead(MapHead):
         """Queries of all groups in training, and of the first group in prediction.
 
         Returns:
-            The vectors that predict the first references, and the content of the queries. Both are
-            one tensor. (N * P, C) each
+            The vectors that predict the first references, and the content of the queries: twice the
+            same tensor. (N * P, C)
         """
         embeddings = self.instance_embedding.weight
         if not self.training:

@@ -1,7 +1,7 @@
 """State keys of the released HRMapNet, which is based on MapTRv2, and their names here.
 
-`rules_of` takes a prefix of the released keys, a prefix of the keys here, and the remainders of the
-keys as one text: each is ``released=here``, or a single name if both are equal.
+The first two arguments of `rules_of` are the prefixes of keys in the release and here. The text
+lists the rest of each key, as ``released=here`` or as one name that both have.
 """
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of
@@ -12,7 +12,7 @@ _BEV_LAYER = "prior.bev.layer."
 _MAP_LAYER = TRANSFORMER + "map_encoder.layers.{i}."
 # Prefixes of the label encoder, released and here.
 _LABEL_ENCODER = (HEAD + "label_encoder.", "prior.queries.label_encoder.")
-# The MapTRv2 release has modules that it never calls. The BEV layer of HRMapNet calls these three.
+# Modules that the released MapTRv2 has but never calls. HRMapNet calls them in its BEV layer.
 _USED_AGAIN = ("positional_encoding.", "transformer.level_embeds", "transformer.cams_embeds")
 _UNUSED = {
     key: value
@@ -37,8 +37,8 @@ HRMAPNET = KeyMap(
         ),
     ),
     unused=_UNUSED,
-    # A checkpoint is recognised as one of HRMapNet if it has keys of both of these parts: of the
-    # encoder that lifts features by their predicted depth, and of the label encoder.
+    # A checkpoint is recognised as HRMapNet's if it has keys of both parts: the encoder that lifts
+    # features by their predicted depth, and the label encoder.
     markers=(LIFTED_MARKER, _LABEL_ENCODER),
 )
 

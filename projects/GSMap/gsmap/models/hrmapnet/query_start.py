@@ -39,8 +39,10 @@ class PriorQueries(BaseModule):
             `raster_prior.py`, which selects the cells, reads ``stride`` and ``threshold``.
         threshold: Value that a channel of a cell must exceed for the cell to be used.
         dropout: Probability to drop an attention weight in training.
-        zero_init: Initialise the output projection with 0, so that a model that was trained without
-            a map keeps its queries. False initialises random weights, as published.
+        zero_init: Whether to initialise the output projection with 0, so that a model that was
+            trained without a map keeps its queries. By default, its weights are random, as
+            published.
+        init_cfg: Initialisation config of mmengine.
     """
 
     def __init__(
@@ -71,18 +73,19 @@ class PriorQueries(BaseModule):
             constant_init(self.attention.out_proj, 0.0)
 
     def forward(self, query: Tensor, keys: MapKeys) -> Tensor:
-        """Attend to the map, without the residual.
+        """Compute changes of the queries by attention to the map.
 
         Args:
             query: Queries. (B, Q, C)
             keys: Cells of the map.
 
         Returns:
-            Changes of the queries, 0 in samples without a valid cell. (B, Q, C)
+            Changes, to be added to the queries; 0 in samples without a valid cell. (B, Q, C)
         """
         tokens = keys.positions + self.label_encoder(keys.values)
         has_cells = keys.is_valid.any(1, keepdim=True)  # (B, 1)
-        # A softmax over no cell has no value: such a sample attends to its padding.
+        # A softmax over no cell is undefined. A sample without a valid cell therefore attends to
+        # its padding, and its change is replaced by 0 below.
         is_blocked = has_cells & ~keys.is_valid
         change, _ = self.attention(
             query=query, key=tokens, value=tokens, key_padding_mask=is_blocked, need_weights=False
@@ -109,7 +112,7 @@ class PriorHook(FlowHook):
         self.points_m: LateValues | None = None
 
     def start(self, head: FlowHead, start: FlowStart) -> FlowStart:
-        """Queries of the head, changed by the map, with references from the changed queries.
+        """Change the queries of the head by the map, and compute their references from the result.
 
         Differs from HRMapNet: where a head's queries have a state and a positional encoding, the
         positional encoding attends to the map, and the result is added to both.
@@ -122,9 +125,9 @@ class PriorHook(FlowHook):
             return start
         states, positions, references = start.queries
         num_rows = _num_rows(head)  # queries of other hooks follow
-        own_positions = positions[:, :num_rows]
-        change = self.queries(own_positions, self.keys)
-        new_positions = own_positions + change
+        head_positions = positions[:, :num_rows]
+        change = self.queries(head_positions, self.keys)
+        new_positions = head_positions + change
         new_states = states[:, :num_rows] + change
         # `head.reference` is the module that computes reference points from positional encodings.
         new_references = head.reference.start(new_positions)
@@ -137,7 +140,7 @@ class PriorHook(FlowHook):
         return start._replace(queries=queries)
 
     def outputs(self, head: Any, layers: list[Predictions]) -> list[Predictions]:
-        """Start to copy the predictions of the last layer to the host, and keep the copies.
+        """Start copying the predictions of the last layer to the host, and store the copies.
 
         Args:
             head: The head.
@@ -155,4 +158,5 @@ def _num_rows(head: Any) -> int:
     """Number of rows of the states of the head's queries."""
     groups = head.query_groups if head.training else head.query_groups[:1]
     num_instances = sum(group.num for group in groups)
-    return num_instances * (head.num_points if head.decoder.point_queries else 1)
+    rows_per_instance = head.num_points if head.decoder.point_queries else 1
+    return num_instances * rows_per_instance

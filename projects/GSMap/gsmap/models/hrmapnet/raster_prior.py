@@ -1,4 +1,4 @@
-"""Raster prior of a detector: reads the map of earlier frames, and writes its predictions."""
+"""Raster prior of a detector: a map of its earlier predictions, which it reads and updates."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -53,8 +53,9 @@ class _Pending(NamedTuple):
 class RasterPrior(PriorModule, AddsWeights):
     """Raster of earlier predictions at a place, as an input of a `MapDetector` (HRMapNet).
 
-    Before a frame, a window of the map is read at its pose. The BEV features are fused with it, and
-    the queries start from it. After the frame, the predictions are drawn and written. Samples need
+    Before a frame, a window of the map is read at the pose of the frame. The BEV features are fused
+    with the window, and the queries start from it. After the frame, the predictions are drawn and
+    written to the map. Samples need
     ``lidar2global`` and ``map_name``; a sample without a pose reads an empty map.
 
     The maps are emptied whenever the mode of the module is set to training or test (`train`).
@@ -63,27 +64,29 @@ class RasterPrior(PriorModule, AddsWeights):
     Args:
         head: Head of the detector, a `MapHead`.
         encoder: BEV encoder of the detector, with its cells as ``grid``.
-        bev: Settings of `PriorBEVFusion`, or None without a fusion.
-        queries: Settings of `PriorQueries`, or None without an initialisation of queries.
-        cell_m: Side of a cell of the map in metres. It divides the side of a BEV cell.
+        bev: Settings of `PriorBEVFusion`; None to leave the BEV features unchanged.
+        queries: Settings of `PriorQueries`; None to leave the queries unchanged.
+        cell_m: Side of a cell of the map in metres. The side of a BEV cell is a multiple of it.
         score_threshold: Predictions with a higher score are written.
         softness: Softness of drawn predictions in squared cells (`draw_elements`).
         released_pixels: Draw predictions half a cell off, as the release does.
-        train_rule: Name of the rule of writing in training as ``name``, and its settings.
-        test_rule: Rule of writing in tests.
+        train_rule: Rule by which predictions are written in training: its name as ``name``
+            (``keep_maximum`` by default), and its settings.
+        test_rule: Rule in tests, given like ``train_rule``; ``last_seen`` by default.
         test_memory: Frames of a test that share a map: all frames of a place (``"kept"``) or of a
             scene (``"scene"``), or none (``"none"``).
-        train_drop: Probability that a sample of a training reads an empty map, so that the model
-            also works without one; 0 as published.
+        train_drop: Probability that a sample reads an empty map in training, so that the model also
+            works without a map; 0 as published.
         neutral_start: Initialise the weights so that the prior has no effect (``residual`` of
             ``bev``, ``zero_init`` of ``queries``). Then it can be trained from the checkpoint of a
             model without a prior. False initialises random weights, as published.
+        init_cfg: Settings of mmengine for the initialisation.
 
     Attributes:
         window: Grid of the map around the vehicle that a frame reads and writes, h x w cells.
         cells: Grid of the BEV features, H x W cells.
         scale: Number of cells of the map along the side of a BEV cell.
-        num_channels: Channels M of the map in each BEV cell: all classes in all of its map cells.
+        num_channels: Channels M of the map in each BEV cell: one for each class in each map cell.
 
     Raises:
         ValueError: If head, encoder or a setting does not fit.
@@ -177,7 +180,7 @@ class RasterPrior(PriorModule, AddsWeights):
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        """Names of the arrays of calibration that the fusion reads."""
+        """Names of the calibration arrays that the fusion uses."""
         return () if self.bev is None else self.bev.calibration
 
     @property
@@ -192,7 +195,7 @@ class RasterPrior(PriorModule, AddsWeights):
         return PlaceMaps(self.classes, self.window, rule=rule, memory=memory)
 
     def new_prior(self, place: str) -> MapPrior:
-        """Create the empty prior of a place, with the rule of tests."""
+        """Create the empty prior of a place, with ``test_rule``."""
         return MapPrior(self.maps.settings_of(place), rule=self.test_rule)
 
     def train(self, mode: bool = True) -> "RasterPrior":
@@ -216,7 +219,7 @@ class RasterPrior(PriorModule, AddsWeights):
         metas: Sequence[dict[str, Any]],
         img_shape: tuple[int, int],
     ) -> dict[str, Any]:
-        """Read the map of a batch, and fuse the outputs of the encoder with it.
+        """Read the map at each sample of a batch, and fuse the outputs of the encoder with it.
 
         Args:
             outputs: Outputs of the encoder: ``bev_feats`` (B, C, H, W), ``img_feats``.
@@ -231,7 +234,7 @@ class RasterPrior(PriorModule, AddsWeights):
         for meta in metas:
             place = None if self._is_dropped() else Place.of(meta)
             windows.append(self.maps.read(place))
-        cells = F.pixel_unshuffle(torch.stack(windows), self.scale)  # (B, M, H, W) on the host
+        cells = F.pixel_unshuffle(torch.stack(windows), self.scale)  # (B, M, H, W), on the CPU
         device = outputs["bev_feats"].device
         calibration = stack_calibration(metas, self.calibration, device)
         host_tensors = [cells]
@@ -252,7 +255,9 @@ class RasterPrior(PriorModule, AddsWeights):
         calibration: Mapping[str, Tensor],
         img_shape: tuple[int, int],
     ) -> dict[str, Any]:
-        """Fuse the outputs of the encoder with a window, by operations of fixed sizes for export.
+        """Fuse the outputs of the encoder with a window of the map, in a form for export.
+
+        The sizes of all tensors are fixed. They do not depend on values.
 
         Args:
             outputs: Outputs of the encoder.
@@ -304,7 +309,7 @@ class RasterPrior(PriorModule, AddsWeights):
         return fused
 
     def hook(self, outputs: Mapping[str, Any]) -> PriorHook:
-        """Hook of a batch into the flow of the head.
+        """Create the hook that applies the prior to the queries of the head for one batch.
 
         Args:
             outputs: Outputs of `fuse` or `fuse_window`.
@@ -366,7 +371,7 @@ class RasterPrior(PriorModule, AddsWeights):
     def _is_dropped(self) -> bool:
         """Decide at random whether a sample reads an empty map (``train_drop``)."""
         if not self.training or self.train_drop == 0:
-            return False  # without a random number, which would change all later ones of a training
+            return False  # no number is drawn, as it would change all later random numbers
         return bool(torch.rand(()) < self.train_drop)
 
     def _select_keys(self, cells: Tensor) -> list[Tensor]:

@@ -34,9 +34,10 @@ class AttentionLayer(nn.Module):
         embed_dims: Channels C.
         num_heads: Heads of each attention.
         ffn_dims: Hidden channels of the feed-forward network.
-        dropout: Probability to drop a value in training.
-        to_memory: Add cross-attention to further features, the memory of `nn.Transformer`.
-        memory_first: Apply the cross-attention before the self-attention.
+        dropout: Probability of dropping a value in training.
+        to_memory: Whether to add cross-attention to further features, which `nn.Transformer` calls
+            the memory.
+        memory_first: Whether to apply the cross-attention before the self-attention.
     """
 
     self_attn: nn.MultiheadAttention
@@ -105,8 +106,9 @@ class AttentionLayer(nn.Module):
 class PointLineDecoder(BaseModule):
     """Decoder of point queries with masked cross-attention.
 
-    Each layer is followed by the prediction of classes and masks of the lines. In the next layer,
-    the points of a line attend to the cells of its mask.
+    Each line of n lines per map class has p point queries. The classes and masks of the lines are
+    predicted after each layer. In the next layer, the points of a line attend to the cells of its
+    mask.
 
     Args:
         queries: Number of lines n, and of points p per line, for every map class.
@@ -114,7 +116,7 @@ class PointLineDecoder(BaseModule):
         num_layers: Number of layers.
         num_heads: Heads of each attention.
         ffn_dims: Hidden channels of the feed-forward networks.
-        line_masks: Restrict the cross-attention to the mask of the line.
+        line_masks: Whether to restrict the cross-attention to the mask of the line.
     """
 
     def __init__(
@@ -188,7 +190,7 @@ class PointLineDecoder(BaseModule):
         """Predict the lines of every class.
 
         Args:
-            states: States of all points. (B, Q, C)
+            states: States of all Q points of all classes. (B, Q, C)
             bev: BEV features. (B, C, H, W)
         """
         states_by_class = self.norm(states).split(self.points_per_class, 1)

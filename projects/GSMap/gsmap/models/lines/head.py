@@ -63,16 +63,17 @@ class LineHead(DetectionHead):
     Args:
         grid: Extent of the map.
         classes: Names of the classes.
-        numbers: Number of lines of each class.
+        numbers: Number of line queries of each class.
         decoder: Settings of `PointLineDecoder`.
         losses: Losses of one class.
-        mask_pixel_m: Side of a pixel in metres, of the masks of lines and classes in training and
-            of their targets.
+        mask_pixel_m: Side of a pixel in metres, in the masks of lines and classes in training and
+            in their targets. A class mask is the union of the masks of all lines of a class.
         score_threshold: Detections need a higher score. With 0.5, a line must be more likely than
             no line.
         embed_dims: Channels C.
         hidden_dims: Hidden channels of the network of map coordinates.
         point_dims: Channels D of the feature of a map coordinate (x, y).
+        init_cfg: Initialisation config of mmengine.
 
     Attributes:
         targets: Description of the targets of the transform, for error messages.
@@ -146,7 +147,7 @@ class LineHead(DetectionHead):
             bev_outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
         """
         outputs = self.decoder(self.front(bev_outputs["bev_feats"]))
-        layers = outputs[1:]  # the first output is of the queries before all layers
+        layers = outputs[1:]  # the first output is computed from the queries before all layers
         mean = self.coordinate_feature()
         return [self.predictions(layer, mean) for layer in layers]
 
@@ -212,7 +213,7 @@ class LineHead(DetectionHead):
             sample: Sample with the targets of the transform.
 
         Raises:
-            ValueError: If the targets are of another transform or mask size.
+            ValueError: If the targets come from another transform, or have another mask size.
         """
         instances = sample.get("gt_instances_3d", InstanceData())
         transform = self.transforms[0]
@@ -234,7 +235,7 @@ class LineHead(DetectionHead):
         raise NotImplementedError
 
     def cases(self, lines: Any, truths: Sequence[Any], tokens: Sequence[str]) -> Iterator[Case]:
-        """Yield the predicted and annotated lines of a class, sample by sample.
+        """Yield a case, the predicted and annotated lines of a class, for each sample.
 
         Args:
             lines: Lines of one layer and class, a NamedTuple of tensors (B, n, ...).

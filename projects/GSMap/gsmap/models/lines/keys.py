@@ -1,7 +1,8 @@
-"""State keys that the released BeMapNet and PivotNet have in common, and their names here.
+"""Rules for the state keys that the released BeMapNet and PivotNet have in common.
 
-`rules_of` takes a prefix of the released keys, a prefix of the keys here, and the remainders of the
-keys as one text: each is ``released=here``, or a single name if both are equal.
+The rules pair these keys with the keys of this project. `rules_of` takes a prefix of the released
+keys, a prefix of the keys here, and the remainders of the keys as one text: each is
+``released=here``, or a single name if both are equal.
 """
 
 import torch

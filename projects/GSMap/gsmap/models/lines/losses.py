@@ -1,4 +1,4 @@
-"""Base class of the losses of lines of one map class: matching, classification, masks."""
+"""Base class of losses for the lines of one map class: matching, classification and masks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class LineLosses:
         cls: Weight of the classification, in losses and in matching.
         mask: Weight of the masks of lines, in losses and in matching.
         semantic: Weight of the masks of whole classes.
-        none_weight: Weight of predictions without a match in the classification.
+        none_weight: Weight, in the classification loss, of predictions without a match.
     """
 
     cls: float = 2.0
@@ -48,7 +48,7 @@ class LineLosses:
     none_weight: float = 0.5
 
     def distances(self, masks: Sequence[Tensor], truths: Sequence[Tensor]) -> list[Tensor]:
-        """Distances between the masks of each sample.
+        """Distances between all predicted and annotated masks of each sample.
 
         Args:
             masks: Logits of the predicted masks of each sample. (n, H, W) each
@@ -72,7 +72,8 @@ class LineLosses:
         Returns:
             Distance of each pair. (M,)
         """
-        # Of the distances of all pairs (M, M), the matched pairs are on the diagonal.
+        # `mask_distances` returns the distances of all pairs (M, M). Matched pairs are on the
+        # diagonal.
         return mask_distances(masks, truths).diagonal()
 
     @torch.no_grad()
@@ -148,7 +149,7 @@ class LineLosses:
 
         Args:
             cases: Lines of the class in each sample.
-            rows: Indices of the matched predictions of each case.
+            rows: Indices of the matched predictions of each case. (m,) each
         """
         logits = torch.cat([case.lines.logits for case in cases])
         labels = []

@@ -30,7 +30,7 @@ def orient_line(line: Points, tolerance: float, sort_rings: bool = False) -> Poi
     Args:
         line: Points (u, v) from the front and from the left. (n, 2)
         tolerance: Largest difference in u of two level ends, in the unit of the points.
-        sort_rings: Let rings start at their rearmost vertex and run clockwise.
+        sort_rings: Whether rings start at their rearmost vertex and run clockwise.
 
     Returns:
         The ordered points. (n, 2)
@@ -96,9 +96,10 @@ class FormatLineTargets(BaseTransform):
         pixel_m: Side of a pixel of the masks in metres. Configs set ``mask_pixel_m`` of the head,
             and the head's `target_settings` set it here.
         thickness_px: Width of the lines in the masks in pixels.
-        step_m: Distance in metres of the samples of a line, from which its key points are computed.
-        sort_rings: Let rings start at their rearmost vertex and run clockwise. Otherwise they keep
-            the annotated order.
+        step_m: Distance in metres between the samples of a line, from which its key points are
+            computed.
+        sort_rings: Whether rings start at their rearmost vertex and run clockwise. Otherwise they
+            keep the annotated order.
 
     Raises:
         ValueError: If a size is not positive, or ``edge_classes`` has an unknown class.
@@ -129,7 +130,7 @@ class FormatLineTargets(BaseTransform):
         raise NotImplementedError
 
     def points(self, line: Points, label: int, grid: BEVGrid) -> Points:
-        """Key points of a line.
+        """Compute the key points of a line.
 
         Args:
             line: Points (u, v) in [0, 1] from the front and the left. (n, 2)
@@ -142,7 +143,7 @@ class FormatLineTargets(BaseTransform):
         raise NotImplementedError
 
     def polyline(self, points: Points, label: int) -> Points:
-        """Polyline through the key points of a line.
+        """Compute the polyline through the key points of a line.
 
         Args:
             points: Key points in [0, 1]. (m, 2)
@@ -181,7 +182,7 @@ class FormatLineTargets(BaseTransform):
         return results
 
     def collect_parts(self, results: dict[str, Any]) -> tuple[list[Part], BEVGrid]:
-        """Parts of the annotated lines, ordered by class, and the raster of the masks.
+        """Collect the parts of the annotated lines, ordered by class, and the raster of the masks.
 
         Args:
             results: Sample with ``x_range``, ``y_range`` and the ground truth.
@@ -198,7 +199,7 @@ class FormatLineTargets(BaseTransform):
         return parts, grid
 
     def lines(self, element: Any, grid: BEVGrid) -> list[Points]:
-        """Parts of an element within the map.
+        """Cut an element into its parts within the map.
 
         Args:
             element: Map element, with ``label`` and ``points`` in metres (n, 2 or 3).

@@ -16,9 +16,9 @@ from gsmap.utils.errors import InputError
 def sine_code(points: Tensor, channels: int) -> Tensor:
     """Sinusoidal positional encoding of points.
 
-    The first half of the channels encodes y, and the second half encodes x. In the half of the
-    coordinate v, channel 2 i is the sine and channel 2 i + 1 the cosine of
-    2 pi v / 10000^(2 i / half).
+    The first half of the channels encodes y, and the second half encodes x. Within the half of a
+    coordinate v, channel 2 i is the sine and channel 2 i + 1 is the cosine of
+    2 pi v / 10000^(2 i / half), where ``half`` is C / 2.
 
     Args:
         points: Points (x, y) in [0, 1]. (..., 2)
@@ -34,7 +34,7 @@ def sine_code(points: Tensor, channels: int) -> Tensor:
 
 
 class Gather(nn.Sequential):
-    """Gathering of MapQR: an MLP from the features of the points of an instance to one query.
+    """Gathering of MapQR: an MLP that maps the features of an instance's points to one query.
 
     Args:
         embed_dims: Channels C.
@@ -58,8 +58,8 @@ class Gather(nn.Sequential):
 class ScatterGatherAttention(BEVDeformableAttention):
     """Scatter-and-gather attention of MapQR.
 
-    Each instance query is copied to its points, these attend to the BEV features, and the results
-    are gathered to one vector per instance.
+    Each instance query is copied to the points of the instance. The points attend to the BEV
+    features, and the results are gathered to one vector per instance.
 
     Args:
         points_per_instance: Points P per instance.
@@ -104,14 +104,14 @@ class ScatterGatherAttention(BEVDeformableAttention):
 class MapQRDecoderLayer(MapDecoderLayer):
     """Decoder layer of MapQR: self-attention of instances, scatter-and-gather attention, FFN.
 
-    Instance queries have no positional encoding. Points have one, the sinusoidal encoding of their
-    reference.
+    Instance queries have no positional encoding. The positional encoding of a point is the
+    sinusoidal encoding of its reference.
 
     Args:
         embed_dims: Channels C, a multiple of 4.
         num_points: Points P per instance.
-        mask_groups: Block self-attention between query groups. The published figures of MapQR are
-            without this mask.
+        mask_groups: Whether to block self-attention between query groups. The published figures of
+            MapQR were obtained without this mask.
         self_attn: Config of the self-attention of instances (`PointSelfAttention`).
         cross_attn: Config of the cross-attention (`ScatterGatherAttention`).
         kwargs: Further arguments of `MapDecoderLayer`.
@@ -131,7 +131,7 @@ class MapQRDecoderLayer(MapDecoderLayer):
     ) -> None:
         if embed_dims % 4:
             raise InputError(f"embed_dims must be divisible by 4, got {embed_dims}.")
-        # For the self-attention, an instance query is the query of an instance of one point.
+        # The self-attention treats an instance query as an instance with one point.
         self_attn_defaults = {"num_points": 1}
         cross_attn_defaults = {"type": "ScatterGatherAttention", "points_per_instance": num_points}
         super().__init__(

@@ -1,4 +1,4 @@
-"""BEV encoder of MapQR (GKT-h): geometry kernels at pillar heights that every layer refines."""
+"""BEV encoder of MapQR (GKT-h): kernel attention at pillar heights that every layer refines."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,15 +18,17 @@ from gsmap.utils.errors import InputTypeError
 class MovingPillars:
     """Pillars of a batch with variable heights, which the layers of the encoder refine in turn.
 
+    A pillar is a column of Z points above the centre of a BEV cell.
+
     Args:
         feet: Homogeneous cell centres at z = 0, in metres. (Q, 4)
-        start: Initial heights, [0, 1] over the range. (Z,)
+        start: Initial heights, [0, 1] over ``z_range``. (Z,)
         z_range: Lowest and highest z in metres.
         img_from_frame: Matrices from metres to pixels. (B, V, 4, 4)
         img_shape: Rows and columns of the padded images.
 
     Attributes:
-        heights: Current heights, [0, 1] over the range, not clipped. (B, Q, Z), initially (Z,)
+        heights: Current heights, [0, 1] over ``z_range``, not clipped. (B, Q, Z), initially (Z,)
         feet: Projections of the argument ``feet``, as homogeneous image points. (B, V, Q, 4)
         upwards: Change of a homogeneous image point per metre of height. (B, V, 1, 1, 4)
     """
@@ -54,7 +56,11 @@ class MovingPillars:
 
         Args:
             offsets_m: Offsets in metres. (B, Q, Z)
-            accumulate: Add them to the current heights, otherwise to the initial ones.
+            accumulate: Whether the offsets are added to the current heights. Otherwise, they are
+                added to the initial ones.
+
+        Returns:
+            Points in the images, and their visibility.
         """
         old_heights = self.heights if accumulate else self.start
         self.heights = old_heights + at_least_float32(offsets_m) / self.extent_m
@@ -75,12 +81,12 @@ class HeightKernelAttention(GeometryKernelAttention):
         embed_dims: Channels C.
         num_heads: Number of heads; head m attends to pillar height m.
         kernel_size: Rows and columns of the kernel.
-        accumulate_heights: Start from the heights of the previous layer, as in the released code.
-            Otherwise start from the evenly spaced heights.
-        released_cells: Use the visible cells of the first sample of the batch for all samples
-            (`GeometryKernelAttention`).
-        equal_weights: Initialise to equal weights over the kernel (`GeometryKernelAttention`), as
-            in the released code.
+        accumulate_heights: Whether offsets are added to the heights of the previous layer, as in
+            the released code. Otherwise, they are added to the evenly spaced heights.
+        released_cells: Whether the visible cells of the first sample of the batch are used for all
+            samples (`GeometryKernelAttention`).
+        equal_weights: Whether the initial weights over the kernel are equal
+            (`GeometryKernelAttention`), as in the released code.
     """
 
     def __init__(

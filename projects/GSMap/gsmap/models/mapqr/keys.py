@@ -1,4 +1,4 @@
-"""State keys of the released MapQR and their names here."""
+"""State keys of the released MapQR and their counterparts in this project."""
 
 from gsmap.checkpoints.key_rules import KeyMap
 from gsmap.models.maptr.keys import (

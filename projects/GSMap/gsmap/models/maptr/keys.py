@@ -38,21 +38,21 @@ _BEV_QUERY_RULES = (
         ENCODER_LAYER, OUR_ENCODER_LAYER, "attentions.1.output_proj.=cross_attn.output_proj."
     ),
 )
-# Weights of box coordinates in a loss that the releases switch off.
+# Weights of box coordinates, which the releases use only in a loss that they switch off.
 CODE_WEIGHTS = {HEAD + "code_weights": torch.ones(4)}
 
-# Fixed offsets of the kernel of the cross-attention, which MapTR's released code saves as a buffer.
+# Fixed offsets of the cross-attention's kernel, which MapTR's released code saves as a buffer.
 GRID_OFFSETS = (
     r"pts_bbox_head\.transformer\.encoder\.layers\.\d+\.attentions\.1\.attention\.grid_offsets"
 )
-# Cross-attention: prefixes (released, here) of the one with a fixed kernel, and the released prefix
-# of the deformable one.
+# Prefixes (released, here) of the cross-attention with a fixed kernel.
 _KERNELS = (ENCODER_LAYER + "attentions.1.attention.", OUR_ENCODER_LAYER + "cross_attn.")
+# Released prefix of the deformable cross-attention.
 _DEFORMABLE = ENCODER_LAYER + "attentions.1.deformable_attention."
 MAPTR = KeyMap(
     "maptr", (*_BEV_QUERY_RULES, _KERNELS), unused=CODE_WEIGHTS, ignored_pattern=GRID_OFFSETS
 )
-# Keys with the markers belong to the architecture with deformable cross-attention, not to MapTR.
+# Checkpoints with the marker keys have deformable cross-attention and are not of MapTR itself.
 MAPTR_BEVFORMER = KeyMap(
     "maptr-bevformer",
     (*_BEV_QUERY_RULES, (_DEFORMABLE, OUR_ENCODER_LAYER + "cross_attn.")),

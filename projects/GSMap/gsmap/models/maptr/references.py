@@ -47,11 +47,14 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
 class PointReference(nn.Module, RefinedReference):
     """References of points, [0, 1] over the map, refined by each decoder layer (MapTR).
 
+    A reference has D entries for each point. Here these are its coordinates; subclasses may add
+    further entries.
+
     Args:
         grid: Extent of the map.
         embed_dims: Channels C of the point states.
         num_layers: Number of decoder layers.
-        coords: 2, or 3 for points with height.
+        coords: Number of coordinates of a point: 2, or 3 with the height.
         z_range: Lowest and highest z in metres, for points with height.
         points_per_state: Number of points n of each query of the decoder. The initial points come
             from the positional query, and each layer refines them from the state of the query. With
@@ -97,7 +100,10 @@ class PointReference(nn.Module, RefinedReference):
             self.branches.append(branch)
 
     def by_point(self, entries: Tensor) -> Tensor:
-        """Split entries of states into points. (..., Q, n * D) -> (..., Q * n, D), >= float32"""
+        """Split the entries of each query into its points. (..., Q, n * D) -> (..., Q * n, D)
+
+        The result is at least float32.
+        """
         by_state = at_least_float32(entries).unflatten(-1, (self.points_per_state, -1))
         return by_state.flatten(-3, -2)
 

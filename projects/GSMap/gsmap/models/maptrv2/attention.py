@@ -12,7 +12,7 @@ class DecoupledSelfAttention(nn.Module):
         embed_dims: Channels C.
         num_heads: Number of heads.
         num_points: Points P per instance.
-        dropout: Probability to drop an attention weight or an output channel in training.
+        dropout: Probability of dropping an attention weight or an output channel in training.
     """
 
     def __init__(

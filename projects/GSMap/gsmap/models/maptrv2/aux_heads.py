@@ -12,7 +12,7 @@ from gsmap.utils.targets import NeedsTargets
 
 @MODELS.register_module()
 class DepthSupervision(nn.Module, NeedsTargets):
-    """Auxiliary head of the depth in a lifting encoder, with LiDAR as ground truth.
+    """Auxiliary head that supervises the depth in a lifting encoder by LiDAR.
 
     Args:
         loss_weight: Weight of the loss.

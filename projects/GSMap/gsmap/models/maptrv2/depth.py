@@ -35,8 +35,8 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
     # A pixel without a return is infinitely far, beyond all bins.
     returns = torch.where(blocks == 0, torch.inf, blocks)
     nearest = returns.amin((-3, -1))  # (..., h, w)
-    # Number of bins from one bin before the first one, as in the released code. A depth in bin i
-    # has a position from i + 1 to i + 2.
+    # Position in bins, counted from one bin before the first bin, as in the released code. A depth
+    # in bin i has a position in [i + 1, i + 2).
     position = (nearest - (low - step)) / step
     valid = (position >= 1) & (position < num_depth_bins(depth_range) + 1)
     # The position 0 of blocks without a target becomes the index -1.

@@ -1,4 +1,4 @@
-"""State keys of the released MapTRv2 and their names here.
+"""Mapping between the state keys of the released MapTRv2 and of this project.
 
 `rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
 Each word of the text continues both prefixes: ``released=here``, or one name for both. `zeros`
@@ -43,7 +43,8 @@ LIFTED_UNUSED: dict[str, Tensor | None] = {
             "transformer.can_bus_mlp.norm.bias": (256,),
         },
     ),
-    # Grid of voxels, here a setting of the config: size, first centre and number (x, y, z).
+    # Grid of voxels, here a setting of the config: size of a voxel, centre of the first voxel and
+    # number of voxels, each along x, y and z.
     ENCODER + "dx": torch.tensor((0.15, 0.15, 20.0)),
     ENCODER + "bx": torch.tensor((-14.925, -29.925, 0.0)),
     ENCODER + "nx": torch.tensor((200.0, 400.0, 1.0)),

@@ -1,4 +1,4 @@
-"""MGMap's decoder: queries activated by masks, attention to four levels, refinement by patches."""
+"""MGMap's decoder: activation of queries by masks, attention to four levels, and refinement."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -63,13 +63,18 @@ class RefinedDecoded(Decoded):
 class MGMapDecoder(MapDecoder):
     """MapTR's decoder on enhanced BEV features, with activated queries and a refinement (MGMap).
 
+    For the activation, a mask is predicted for each instance, and a projection of the mean BEV
+    feature under the mask is added to the queries. The refinement corrects the points of the last
+    layer in several stages.
+
     Args:
         layer: Settings of the layer, `MapDecoderLayer` with `MultiLevelAttention`.
         embed_dims: Channels C of the queries and of the BEV features.
-        num_masks: Number of instance queries of all groups, each with a mask.
+        num_masks: Number of masks, one for each instance query of all query groups.
         patches: Whether the refinement uses a patch around each point. The released model uses
             patches of zeros, so that the correction of a point does not depend on its position.
-        refinements: Number of refinement stages, which use the branches of the last layers.
+        refinements: Number of refinement stages, which use the prediction branches of the last
+            layers.
         refine_ffn_dims: Hidden channels of the feed-forward networks of the refinement.
         kwargs: Further arguments of `MapDecoder`.
 
@@ -137,10 +142,10 @@ class MGMapDecoder(MapDecoder):
             query_pos: Learned positions of the queries. (B, N * P, C)
             reference: Initial references. (B, N * P, D)
             bev_feats: BEV features. (B, C, H, W)
-            refine: Function from the number of a branch, point states (B, N * P, C) and references
-                (B, N * P, D) to refined references.
+            refine: Function from the index of a branch, point states (B, N * P, C) and references
+                (B, N * P, D) to refined references (B, N * P, D).
             attn_mask: True where an instance does not attend to another one, or None. (N, N)
-            between: Function from the number of a layer and the queries after it to the queries of
+            between: Function from the index of a layer and the queries after it to the queries of
                 the next layer, or None.
 
         Returns:
@@ -148,8 +153,8 @@ class MGMapDecoder(MapDecoder):
         """
         fused_feats, levels = self.neck(bev_feats)
         num_instances = query.shape[1] // self.num_points
-        # The network has masks for the instances of all query groups. In inference, only the first
-        # group is there, which has the first masks.
+        # The network predicts masks for the instances of all query groups. In inference, there is
+        # only the first group, to which the first masks belong.
         masks = self.mask_net(fused_feats)[:, :num_instances]  # (B, N, H, W)
         instance_feats = self.instance_features(fused_feats, masks)
         mask_embeddings = self.activation(instance_feats)  # (B, N, C)
@@ -171,7 +176,7 @@ class MGMapDecoder(MapDecoder):
 
     @staticmethod
     def instance_features(feats: Tensor, mask_logits: Tensor) -> Tensor:
-        """Average features under the masks of instances.
+        """Average features with the masks of instances as weights.
 
         Args:
             feats: Features. (B, C, H, W)
@@ -192,7 +197,7 @@ class MGMapDecoder(MapDecoder):
         Args:
             last: Output of the last layer.
             fused_feats: BEV features of all levels of the neck. (B, C, H, W)
-            refine: Function from the number of a branch, point states and references to refined
+            refine: Function from the index of a branch, point states and references to refined
                 references.
             attn_mask: True where an instance does not attend to another one, or None. (N, N)
 

@@ -1,7 +1,8 @@
 """Mapping between the state keys of the released MGMap and of this project.
 
-`rules_of` takes a prefix of the released keys, a prefix of the keys here, and the remainders of the
-keys as one text: each is ``released=here``, or a single name if both are equal.
+`rules_of` takes the prefix of the released keys, the prefix of this project's keys, and the pairs
+of remainders after the prefixes as one text. A pair is ``released=here``, or a single name if both
+remainders are equal.
 """
 
 from gsmap.checkpoints.key_rules import KeyMap, Rules, rules_of

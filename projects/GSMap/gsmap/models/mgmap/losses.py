@@ -20,8 +20,8 @@ class QueryMaskLoss(MapLoss):
     """Cross-entropy and dice loss of the masks that activate the queries (MGMap).
 
     As in the released code, the cross-entropy is averaged over all queries, with empty targets for
-    unmatched ones, and multiplied by the share of matched queries. The dice loss is summed over the
-    matched queries and divided by the number of all queries.
+    unmatched queries, and multiplied by the share of matched queries. The dice loss is summed over
+    the matched queries and divided by the number of all queries.
 
     Args:
         loss_weight: Weight of the cross-entropy.
@@ -40,7 +40,7 @@ class QueryMaskLoss(MapLoss):
         """Check that the head has a mask for each query.
 
         Raises:
-            ValueError: If the decoder has no masks, or if their number differs from the queries'.
+            ValueError: If the decoder has no masks, or not as many as there are queries.
         """
         num_queries = len(head.instance_embedding.weight)
         num_masks = get_decoder(self, head).num_masks
@@ -64,6 +64,7 @@ class QueryMaskLoss(MapLoss):
         targets = torch.zeros_like(logits)
         targets[pairs.samples, pairs.query_inds] = masks
         num_queries = logits.shape[0] * logits.shape[1]
+        # Mean over all queries, times M. The division by `num_queries` below gives the share.
         cross_entropy = F.binary_cross_entropy_with_logits(logits, targets) * len(matched_logits)
         dice = dice_loss(matched_logits.sigmoid(), masks, reduction="sum")
         return (self.loss_weight * cross_entropy + self.dice_weight * dice) / num_queries

@@ -13,8 +13,8 @@ class PointsOfInstances(nn.Linear):
 
     Args:
         num_points: Points per instance P.
-        embed_dims: Channels C of a query. An embedding has 2 C channels, for the state and the
-            positional encoding of the query.
+        embed_dims: Channels C of a query. An embedding has 2 C channels: C for the state and C for
+            the positional encoding of the query.
     """
 
     def __init__(self, num_points: int, embed_dims: int) -> None:
@@ -32,6 +32,6 @@ def points_from_instances(value: bool) -> PartConfig:
     """Return the settings of a head with `PointsOfInstances`.
 
     Args:
-        value: Whether the head computes point embeddings in this way.
+        value: Whether the head computes point embeddings from instance embeddings.
     """
     return {"point_queries": {"type": PointsOfInstances}} if value else {}

@@ -14,7 +14,7 @@ _PATCH_SHARE = 0.1  # side of a patch divided by the side of the map
 
 
 def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
-    """Crop patches of a tenth of the map's sides by bilinear sampling (RoIAlign).
+    """Crop patches, whose sides are a tenth of the map's sides, by bilinear sampling (RoIAlign).
 
     As in RoIAlign with ``aligned=False``, values lie at integer positions, and sampling points more
     than a cell outside the map are 0.
@@ -46,7 +46,7 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     locations = (samples_on_map + 0.5) / size
     values = feats.float().flatten(2).transpose(1, 2)  # (B, H * W, C)
     values = values[:, :, None]  # (B, H * W, 1, C)
-    # A bin is the mean of its sampling points, of which points outside the map are 0.
+    # A bin is the mean over its sampling points. Points outside the map count as 0.
     patches = deformable_sample(
         values, (height, width), locations=locations, weights=inside / SAMPLES**2
     )
@@ -119,7 +119,7 @@ class PatchRefinement(BaseModule):
     """Refinement of point states by the patches around the points (MGMap).
 
     The features of the patches attend to one another and to the states. Then the states are fused
-    with them.
+    with these features.
 
     Args:
         embed_dims: Channels C of the patches and of the corrected states.
@@ -180,12 +180,13 @@ class PatchRefinement(BaseModule):
         glimpses = glimpses.expand(states.shape[0], states.shape[1], -1)
         memory = self.memory(states)
         glimpses = self.norm(self.layer(glimpses, memory, tgt_mask=mask, memory_mask=mask))
+        # The gradient reaches the input states only through the memory of the attention.
         corrected_states = self.fuser(torch.cat([states.detach(), glimpses], dim=-1))
         return corrected_states, glimpses
 
 
 def mask_network(embed_dims: int, masks: int, activation: nn.Module) -> nn.Sequential:
-    """Create a network that predicts masks: a 3x3 convolution with BatchNorm, then a 1x1 one.
+    """Create a network that predicts masks by a 3x3 convolution with BatchNorm and a 1x1 one.
 
     Args:
         embed_dims: Channels C of the input. (B, C, H, W)

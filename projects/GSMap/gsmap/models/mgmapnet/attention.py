@@ -1,4 +1,4 @@
-"""MGMapNet's attention: instance queries and their point queries use common BEV samples."""
+"""MGMapNet's attention, in which instance and point queries share their BEV samples."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -171,11 +171,10 @@ class PerPointSampling(SamplingAttention):
 
 @MODELS.register_module()
 class MultiPointAttention(PerPointSampling):
-    """Attention that updates the instance queries alone, from samples around all of their points.
+    """Attention that updates only the instance queries, from samples around all of their points.
 
     A linear layer computes the point queries from the instance query. This attention is the
-    baseline in the tables of MGMapNet and corresponds to `LinePointAttention`, in which instance
-    queries sample near the points of their lines.
+    baseline in the tables of MGMapNet. It corresponds to `LinePointAttention` of StreamMapNet.
 
     Args:
         embed_dims: Channels C.
@@ -285,11 +284,11 @@ class MultiGranularityAttention(PerPointSampling):
     def aggregate(self, feats: Sequence[Tensor], samples: Samples) -> tuple[Tensor, Tensor]:
         """Aggregate the sampled features to instance queries and point queries.
 
-        Both kinds of weights are softmax functions of equal logits, over different axes. The sum
-        over K of the weights for instances is the share of a point and level. The weight of a
-        sample for its instance is this share times the weight for its point. An instance query is
-        therefore the sum of the point features, weighted by their shares, and the features are
-        sampled only once.
+        Both kinds of weights are softmax functions of equal logits, over different axes. The share
+        of a point and level is the sum over K of the weights for instances. The weight of a sample
+        for its instance is this share times the weight of the sample for its point. An instance
+        query is therefore the sum of the point features, weighted by their shares. So the features
+        are sampled only once.
 
         Args:
             feats: Levels of BEV features, the finest first. (B, C, H, W) each

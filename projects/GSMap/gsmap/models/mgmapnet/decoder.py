@@ -17,8 +17,8 @@ from gsmap.models.mgmapnet.bev_pyramid import BEVPyramid
 class MGMapNetDecoderLayer(MapDecoderLayer):
     """Decoder layer of instance and point queries with `MultiGranularityAttention` to the BEV.
 
-    It consists of the self-attention of the instances, the attention to the BEV, and one
-    feed-forward network each for instance queries and for point queries.
+    It consists of the self-attention of the instances, the attention to the BEV features, a
+    feed-forward network for the instance queries, and another one for the point queries.
 
     Args:
         embed_dims: Channels C of the queries.
@@ -54,7 +54,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             embed_dims,
             ffn_dims=ffn_dims,
             dropout=dropout,
-            # The self-attention has one query per instance, as a line of one point.
+            # The self-attention has one query per instance, as if each line had one point.
             self_attn={"num_points": 1, **(self_attn or {})},
             cross_attn={**cross_attn_defaults, **(cross_attn or {})},
             **kwargs,
@@ -100,7 +100,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         feats: Sequence[Tensor],
         attn_mask: Tensor | None,
     ) -> Granularities:
-        """Apply all parts of the layer but the feed-forward network of the points.
+        """Apply all parts of the layer except the feed-forward network of the points.
 
         Args:
             state: Queries of the previous layer.
@@ -159,8 +159,8 @@ class MGMapNetDecoded(Decoded):
         references: Refined references, float32. (B, N, P, D)
         instance_states: States of the instance queries, from which classes are predicted.
             (B, N, C)
-        mean_locations: Mean of each point's sampling locations (x, y), [0, 1] over the map, not
-            clipped. (B, N, P, 2)
+        mean_locations: Mean of the sampling locations (x, y) of each point, in the scale [0, 1]
+            over the map, not clipped. (B, N, P, 2)
     """
 
     mean_locations: Tensor
@@ -170,8 +170,8 @@ class MGMapNetDecoded(Decoded):
 class MGMapNetDecoder(MapDecoder):
     """Decoder of MGMapNet, with instance queries and point queries.
 
-    The inputs are instance queries with one reference each. The points of an instance all start
-    from this reference, and each layer refines each of them.
+    The inputs are instance queries with one reference each. All points of an instance start from
+    its reference, and each layer refines each point.
 
     Args:
         layer: Settings of `MGMapNetDecoderLayer`. Its ``reference_dims`` applies from the second
@@ -192,7 +192,7 @@ class MGMapNetDecoder(MapDecoder):
         **kwargs: Any,
     ) -> None:
         super().__init__(layer or {}, **kwargs, embed_dims=embed_dims, num_levels=num_levels)
-        # Differs from the poster: as in the released model, the first layer adds the learned
+        # Differs from the poster: as in the released model, the first layer uses the learned
         # position instead of an encoding of the references.
         self.layers[0].reference_code = None
         self.bev_pyramid = BEVPyramid(embed_dims, num_levels)

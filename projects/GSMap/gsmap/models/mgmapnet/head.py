@@ -74,8 +74,9 @@ class MGMapHead(MapHead):
 def convert_decoder(decoder: PartConfig) -> PartConfig:
     """Convert the settings of a decoder to settings of `MGMapNetDecoder`.
 
-    The layers and attentions in the configs of MapTR and MapTRv2 need one query per point. They are
-    replaced, and a log message names them. Other attentions are kept.
+    The layers and attentions in the configs of MapTR and MapTRv2 need one query per point. Their
+    settings are left out, so that the defaults of MGMapNet replace them, and a log message names
+    them. Other attentions are kept.
     """
     decoder_class = class_of(decoder)
     if decoder_class is not None and issubclass(decoder_class, MGMapNetDecoder):
@@ -89,7 +90,7 @@ def convert_decoder(decoder: PartConfig) -> PartConfig:
     if class_of(self_attn) is DecoupledSelfAttention:
         replaced_parts["self_attn"] = layer.pop("self_attn")
     cross_attn = layer.get("cross_attn") or {}
-    # Settings without a type are of `BEVDeformableAttention`, the default of `MapDecoderLayer`.
+    # Settings without a type belong to `BEVDeformableAttention`, the default of `MapDecoderLayer`.
     if class_of(cross_attn) in (None, BEVDeformableAttention):
         replaced_parts["cross_attn"] = layer.pop("cross_attn", None)
     configured_parts = {name: part for name, part in replaced_parts.items() if part}

@@ -39,7 +39,8 @@ def instance_mask_losses(
     targets = targets.float()
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
     dice = dice_loss(logits.sigmoid(), targets)
-    return cross_entropy.mean(dim=(1, 2)).sum() / avg_factor, dice.sum() / avg_factor
+    mask_cross_entropy = cross_entropy.mean(dim=(1, 2))  # (M,)
+    return mask_cross_entropy.sum() / avg_factor, dice.sum() / avg_factor
 
 
 @MODELS.register_module()

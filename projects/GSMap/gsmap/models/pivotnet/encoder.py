@@ -20,10 +20,10 @@ Shapes = Sequence[tuple[int, int]]
 
 
 class DeformableLayer(nn.Module):
-    """Layer of successive deformable attentions and a feed-forward network; post-norm.
+    """Layer of successive deformable attentions and a feed-forward network, with post-norm.
 
     Args:
-        levels: Number of maps of each attention.
+        levels: Number of feature maps that each attention samples.
         embed_dims: Channels C of the tokens and of the maps.
         num_heads: Number of attention heads.
         num_points: Number of samples per head and map.
@@ -62,8 +62,8 @@ class DeformableLayer(nn.Module):
         Args:
             tokens: Tokens. (B, Q, C)
             position: Positional embeddings. (Q, C)
-            views: For each attention its maps (B, C, h, w) and the references of the tokens in
-                [0, 1] over each map (B, Q, 2).
+            views: For each attention, a pair of its maps, (B, C, h, w) each, and the references of
+                the tokens in [0, 1] over each map (B, Q, 2).
 
         Returns:
             Updated tokens. (B, Q, C)
@@ -91,7 +91,7 @@ class PivotBEVEncoder(CameraEncoder):
         bev_pixel_m: Side of a BEV cell in metres.
         embed_dims: Channels C of the BEV features.
         num_cams: Number V of cameras, in the order of concatenation.
-        num_layers: Number of layers over the cameras, and number of BEV layers.
+        num_layers: Number of layers over the camera maps, and number of BEV layers after them.
         layer_cfg: Settings ``num_heads``, ``num_points`` per map, ``ffn_dims`` and ``dropout`` of
             all layers.
         camera_by: Choice of the camera of a cell: the one with the largest ``"depth"``, as in the
@@ -152,7 +152,7 @@ class PivotBEVEncoder(CameraEncoder):
         self.unseen_reference = nn.Linear(embed_dims, 2)
 
     def init_weights(self) -> None:
-        """Initialise matrices with Xavier's method; embeddings are initialised normally."""
+        """Initialise matrices with Xavier's method; embeddings keep torch's initial values."""
         super().init_weights()
         for module in (self.source_layers, self.bev_layers, self.unseen_reference):
             init_matrices(module)
@@ -218,7 +218,7 @@ class PivotBEVEncoder(CameraEncoder):
             pixels.append(project(level).flatten(2))
         tokens = torch.cat(pixels, dim=2).transpose(1, 2)  # (B, pixels of all levels, C)
         position = torch.cat(list(self.source_pos.parameters()))
-        tokens = tokens + position  # As in the released code, values have the position, too.
+        tokens = tokens + position  # as in the released code, where values include the position
         reference = centres(self.shapes, position.device).expand(len(tokens), -1, -1)
         for layer in self.source_layers:
             tokens = layer(tokens, position, (split_maps(tokens, self.shapes), reference))
@@ -232,8 +232,8 @@ class PivotBEVEncoder(CameraEncoder):
             img_shape: Rows and columns of the padded images.
 
         Returns:
-            Positions in [0, 1] over all concatenated cameras (B, H * W, 2), and True for cells
-            inside the image of their camera. (B, H * W)
+            Positions in [0, 1] over all concatenated cameras (B, H * W, 2), and whether each cell
+            is inside the image of its camera. (B, H * W)
         """
         matrices = img_from_ground.float()
         # `flip` changes (position from the left, position from the front) to the reverse order.

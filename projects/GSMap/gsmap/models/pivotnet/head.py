@@ -1,4 +1,4 @@
-"""PivotNet's head: lines of points, some of which are pivots, the vertices of the map elements."""
+"""PivotNet's head. It predicts lines of points, and which points are pivots (vertices)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from gsmap.utils.errors import InputError
 
 @dataclass(frozen=True)
 class PivotReference(Reference):
-    """References of points with the logit of a pivot: (u, v, logit), u and v in [0, 1].
+    """References (u, v, logit): a point, with u and v in [0, 1], and its logit of being a pivot.
 
     Args:
         grid: Extent of the map, in metres.
@@ -33,14 +33,14 @@ class PivotReference(Reference):
     outputs = ("pts", "num_pts")
 
     def decode(self, references: Tensor) -> Tensors:
-        """Select the pivots of every line, the points of positive logit, in order.
+        """Select the pivots of each line in order. Pivots are the points with a positive logit.
 
         Args:
-            references: Points (from the front, from the left) with logits. (N, P, 3)
+            references: Points (u from the front, v from the left) with logits. (N, P, 3)
 
         Returns:
-            ``pts``, the pivots in metres, with the last pivot repeated up to P points, (N, P, 2);
-            and ``num_pts``, the numbers of pivots, (N,).
+            ``pts``, the pivots in metres, where the last pivot is repeated up to P points
+            (N, P, 2), and ``num_pts``, the number of pivots of each line (N,).
         """
         is_dropped = references[..., 2] <= 0
         index = torch.arange(is_dropped.shape[1], device=is_dropped.device)
@@ -55,12 +55,12 @@ class PivotReference(Reference):
 
 
 def pack_lines(lines: list[Lines]) -> LinePredictions:
-    """Join the lines of all classes to predictions; the ends of a line are always pivots."""
+    """Join the lines of all classes to predictions. The ends of a line are always pivots."""
     longest = max(class_lines.points.shape[2] for class_lines in lines)
     references = []
     logits = []
     for class_lines in lines:
-        point_logits = class_lines.point_logits  # of a pivot and of no pivot, (B, n, p, 2)
+        point_logits = class_lines.point_logits  # of being a pivot, and of being none, (B, n, p, 2)
         pivot_logit = point_logits[..., PIVOT, None] - point_logits[..., 1 - PIVOT, None]
         ends = torch.ones_like(pivot_logit[:, :, :1])
         pivot_logit = torch.cat([ends, pivot_logit[:, :, 1:-1], ends], dim=2)  # (B, n, p, 1)
@@ -76,7 +76,7 @@ def pack_lines(lines: list[Lines]) -> LinePredictions:
 
 @MODELS.register_module()
 class PivotHead(LineHead):
-    """Head of lines with a number of queries and of points for each class (PivotNet).
+    """Head of PivotNet, with a number of lines and a number of points per line for each class.
 
     Args:
         grid: Extent of the map, in metres.

@@ -1,4 +1,7 @@
-"""PivotNet's losses of one map class: lines, masks, pivots and collinear points between them."""
+"""PivotNet's losses of one map class: lines, masks, pivots and collinear points.
+
+Pivots are the vertices of map elements. Collinear points lie on the segments between pivots.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -52,8 +55,8 @@ class PivotLosses(LineLosses):
         mask: Weight of the masks of lines in matching and loss.
         semantic: Weight of the masks of whole classes in the loss.
         none_weight: Weight of predictions without a matched line in the class loss.
-        pivots: Weight of the matched pivots in the loss, and in matching, of the mean difference of
-            the pivots of a line and the points that are paired with them in order.
+        pivots: Weight of the matched pivots in the loss. In matching, weight of the mean difference
+            between the pivots of a line and the points that are paired with them in order.
         collinear: Weight of the points between pivots in the loss.
         point_cls: Weight of the classification of points as pivots in the loss.
         end_weight: Additional weight of a line's ends among its pivots, in matching and loss.
@@ -97,7 +100,7 @@ class PivotLosses(LineLosses):
         points = np.arange(num_points)
         for pair, (row, col) in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
             line = pivots[col, : counts[col]]
-            # `path` has the index of the point for each pivot, in ascending order.
+            # `path` contains the index of the point that is matched with each pivot, ascending.
             path = match_pivots(differences[row, col, : len(line)])
             is_pivot[pair, path] = True
             # The targets of the points between two pivots are spaced evenly between them.
@@ -114,8 +117,8 @@ class PivotLosses(LineLosses):
             matches: Matched lines of each case.
 
         Returns:
-            ``mask``, ``pivots``, ``collinear``, ``cls`` and ``point_cls``, divided by the number of
-            annotated lines except for ``cls``.
+            ``mask``, ``pivots`` and ``collinear``, divided by the number of annotated lines,
+            ``cls``, and ``point_cls``, divided by this number if ``point_cls_per_line``.
         """
         num_annotated = 0
         rows = []

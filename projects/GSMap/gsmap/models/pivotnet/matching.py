@@ -1,6 +1,6 @@
 """PivotNet's dynamic matching of the pivots of annotated lines with predicted points.
 
-Pivots are the vertices that define the shape of a line, its two ends among them. Each pivot is
+Pivots are the vertices that define the shape of a line, including its two ends. Each pivot is
 matched with one predicted point, in order. Predicted points may remain without a pivot.
 """
 
@@ -19,7 +19,7 @@ def path_costs(costs: Floats) -> Floats:
     pivots 0 to i if pivot i is matched with point j. It is infinite if that is not possible.
 
     Args:
-        costs: Differences of m pivots and p points. (..., m, p)
+        costs: Differences between m pivots and p points. (..., m, p)
 
     Returns:
         Lowest total costs. (..., m, p)
@@ -37,8 +37,8 @@ def sequence_costs(costs: Floats, lengths: NDArray[np.integer], end_weight: floa
     """Compute the mean matching costs of predicted and annotated lines.
 
     Args:
-        costs: Differences of the pivots of K annotated lines and the points of N predicted lines.
-            The last pivot is matched with the last point. (N, K, m, p)
+        costs: Differences between the pivots of K annotated lines and the points of N predicted
+            lines. The last pivot is matched with the last point. (N, K, m, p)
         lengths: Number of pivots of each annotated line. (K,)
         end_weight: Additional weight of the ends of a line, >= 0.
 
@@ -56,7 +56,7 @@ def match_pivots(costs: Floats) -> NDArray[np.int64]:
     """Return the point that is matched with each pivot, the first one of equally good points.
 
     Args:
-        costs: Differences of m pivots and p points. (m, p)
+        costs: Differences between m pivots and p points. (m, p)
 
     Returns:
         Indices of the points, increasing. (m,)
@@ -69,7 +69,8 @@ def match_pivots(costs: Floats) -> NDArray[np.int64]:
         raise InputError(f"{num_pivots} pivots cannot be matched with {num_points} points.")
     table = path_costs(costs)
     path = np.full(num_pivots, fill_value=num_points - 1)
-    # The last pivot has the last point. Go back: the pivot before has the best earlier point.
+    # The last pivot is matched with the last point. From there backwards, each previous pivot is
+    # matched with the best earlier point.
     for row in range(num_pivots - 1, 0, -1):
         path[row - 1] = table[row - 1, : path[row]].argmin()
     return path

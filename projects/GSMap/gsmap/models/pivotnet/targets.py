@@ -29,8 +29,8 @@ def significances(points: Points) -> NDArray[np.float64]:
     areas = np.full(len(points), fill_value=np.inf)
     areas[1:-1] = _triangle_areas(points[:-2], points[1:-1], points[2:])
     remaining = list(range(len(points)))
-    # If a neighbour of the removed point is not more significant, it is removed next, and this is
-    # its position. Otherwise this is 0, the position of an end, which is never removed.
+    # Position of a neighbour of the removed point that is not more significant and is therefore
+    # removed next. It is 0 if there is no such neighbour (0 is an end, which is never removed).
     next_position = 0
     while len(remaining) > 2:
         position = next_position or int(np.argmin(areas[remaining]))
@@ -64,10 +64,10 @@ class FormatPivotTargets(FormatLineTargets):
     The fields of the targets and the other settings are described in `FormatLineTargets`.
 
     Args:
-        num_points: Largest number P of pivots of a line of each class, >= 2. Filled in from the
-            queries of the head if the pipeline does not set it.
+        num_points: Largest number of pivots of a line of each class, >= 2. Taken from the queries
+            of the head if the pipeline does not set it.
         min_area_m2: Smallest significance of a pivot, in square metres.
-        keep_end: Whether a line of too many pivots keeps the most significant ones. By default it
+        keep_end: Whether a line with too many pivots keeps the most significant ones. By default it
             keeps the first ones and loses its end, as in the released code.
 
     Raises:

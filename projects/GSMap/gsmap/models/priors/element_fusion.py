@@ -27,16 +27,17 @@ _CELL_M = 0.3  # side of the cells of the window of a `PriorModule`; elements ne
 class ElementFusion(PriorModule):
     r"""Fusion of detections with the elements of an `ElementPrior` at the pose of a frame.
 
-    A detection belongs to the nearest element of its class within ``gate_m``. With s, the best
-    score of its detections, or 0 without one, an element of confidence c gets the score
+    A detection belongs to the nearest element of its class within ``gate_m``. An element gets the
+    score
 
     .. math:: 1 - (1 - c\,(m + (1 - m)\,s))\,(1 - s)
 
-    where m is ``missed_share``. The element replaces its detections, because the mean of many
-    frames is more accurate than one frame. All other detections stay as they are. There are no
-    weights and there is no training, so any trained model with a `MapHead` can use it. Without a
-    prior, the detections do not change, and a warning is logged. This module is not part of a
-    published method.
+    where c is its confidence, s is the best score of its detections (0 without a detection), and m
+    is ``missed_share``. The element replaces its detections, because the mean of many frames is
+    more accurate than one frame. All other detections stay as they are. The module has no weights
+    and needs no training, so any trained model with a `MapHead` can use it. Without a prior, the
+    detections do not change, and a warning is logged. This module is not part of a published
+    method.
 
     Args:
         head: Head of the detector, a `MapHead`.
@@ -44,12 +45,11 @@ class ElementFusion(PriorModule):
         gate_m: Largest distance between a detection and an element that belong together, in metres.
             The distance is the larger of two means: the mean distance of the points of the
             detection to the element, and of the points of the element to the detection.
-        missed_share: Share of its confidence that is left to an element without a detection, in
-            [0, 1].
+        missed_share: Share of its confidence that an element without a detection keeps, in [0, 1].
+        init_cfg: Initialisation config of mmengine.
 
     Raises:
-        ValueError: If the head is no `MapHead`, its points have heights, or a setting is out of
-            range.
+        ValueError: If the head is no `MapHead`, or a setting is out of range.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class ElementFusion(PriorModule):
         self._has_warned = False
 
     def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
-        """Maps that `PriorModule.maps_of` makes of the priors of a user, after a check.
+        """Check the priors of a user, and prepare them as `PriorModule.maps_of` does.
 
         Raises:
             ValueError: If a prior is no `ElementPrior`, has other classes, or is to be written.
@@ -99,7 +99,8 @@ class ElementFusion(PriorModule):
             Detections of each sample, highest score first. Without a prior, these are ``results``.
 
         Raises:
-            ValueError: If the place of a sample is unknown or has no prior.
+            ValueError: If the place of a sample is unknown or has no prior, or if detections have
+                heights or fields that elements do not have.
         """
         maps = self._given  # set by `PriorModule.use`; `GivenMaps` are the priors of a user
         if not isinstance(maps, GivenMaps):
@@ -175,7 +176,7 @@ class ElementFusion(PriorModule):
 
 
 def _distances(points: Tensor, labels: Tensor, lines: Tensor, line_labels: Tensor) -> Tensor:
-    """Distances between detections and elements of one class.
+    """Compute the distances between detections and elements of equal class.
 
     Args:
         points: Points of the detections in metres. (N, P, 2)

@@ -18,18 +18,18 @@ from gsmap.utils.errors import InputError
 class PriorModule(BaseModule):
     """Part ``prior`` of a `MapDetector`, which reads maps of earlier frames.
 
-    For each batch the detector calls `fuse` with the outputs of the encoder, `hook` for the flow of
-    the head, `update_detections` with the detections and `keep` with the hook. This base class does
-    nothing there.
+    For each batch the detector calls `fuse` with the outputs of the encoder, `hook` for a hook into
+    the head, `update_detections` with the detections, and `keep` with the hook. In this base class,
+    these methods have no effect.
 
     Args:
         head: Head of the detector, a `MapHead`.
-        cell_m: Side in metres of the cells in which a frame reads maps.
+        cell_m: Side in metres of the square cells at which maps are read.
 
     Attributes:
-        reads_window: Whether `fuse` needs a window of a map, which then is an input of an exported
+        reads_window: Whether `fuse` needs a window of a map, which is then an input of an exported
             network.
-        window: Extent of a frame and the cells in which it reads maps.
+        window: Extent of a frame, divided into the cells at which maps are read.
         classes: Names of the classes.
 
     Raises:
@@ -69,15 +69,15 @@ class PriorModule(BaseModule):
         )
 
     def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
-        """Maps of a user, for `use` and `using`.
+        """Maps from the priors of a user, as arguments of `use` and `using`.
 
         Args:
             priors: The priors, one for each place.
-            update: Write each frame to them after it is predicted.
+            update: Write each frame to the priors after it is predicted.
 
         Raises:
-            ValueError: If a prior has other classes or cells, two are of one place, or this module
-                does not read or write such priors.
+            ValueError: If a prior has other classes or cells, if two priors are of one place, or if
+                this module does not read or write such priors.
         """
         return GivenMaps(priors, self.classes, grid=self.window, update=update)
 
@@ -85,10 +85,10 @@ class PriorModule(BaseModule):
         """Write the predictions that were passed to `keep` into the maps."""
 
     def use(self, maps: PlaceMaps | None) -> None:
-        """Use these maps in tests from now on; None for the maps of the model.
+        """Use these maps in tests from now on.
 
         Args:
-            maps: Maps of `maps_of` or `new_maps`.
+            maps: Maps of `maps_of` or `new_maps`; None for the maps of the model.
         """
         self.flush()
         self._given = maps
@@ -126,7 +126,7 @@ class PriorModule(BaseModule):
         return dict(outputs)
 
     def hook(self, outputs: Mapping[str, Any]) -> FlowHook | None:
-        """Hook of a batch into the flow of the head, or None.
+        """Create the hook that the head calls for a batch; None for no hook.
 
         Args:
             outputs: Outputs of `fuse`.
@@ -145,7 +145,7 @@ class PriorModule(BaseModule):
         return list(results)
 
     def keep(self, hook: Any, metas: Sequence[Mapping[str, Any]]) -> None:
-        """Keep the predictions of a batch, to be written by `flush`.
+        """Store the predictions of a batch until `flush` writes them.
 
         Args:
             hook: Hook of the batch, after the head has run.

@@ -31,7 +31,7 @@ class LinePointAttention(BEVDeformableAttention):
             query: Instance queries. (B, N, C)
             reference: References of their points, which begin with (x, y) in [0, 1] over the map.
                 (B, N * P, D)
-            shape: Rows and columns of the map.
+            shape: Rows and columns of the BEV features.
             frames: Rotations of the offsets of each point, or None. (B, N * P, 2, 2)
 
         Returns:

@@ -103,7 +103,8 @@ class StreamMapNetDecoder(MapDecoder):
             features with the sine encoding (B, C, H, W).
         """
         cells = bev_feats.new_zeros((1, *bev_feats.shape[-2:]), dtype=torch.bool)
-        # StreamMapNet counts rows from the largest y, and the BEV features from the smallest y.
+        # The first row of StreamMapNet's encoding is at the largest y, but the first row of the BEV
+        # features is at the smallest y.
         code = self.code(cells).flip(2)
         points = reference.unflatten(-1, (self.num_points, -1)).flatten(1, 2)
         return query, points, self.input_proj(bev_feats) + code

@@ -17,7 +17,8 @@ class StreamMapNetEncoderLayer(BEVEncoderLayer):
 
     Args:
         cross_attn: Settings of the camera cross-attention.
-        mirrored: Whether a cell attends around the row mirrored at the middle of the map.
+        mirrored: Whether a cell attends around its mirror image: the cell in its column whose row
+            is counted from the other end of the map.
         kwargs: Further arguments of `BEVEncoderLayer`.
     """
 
@@ -26,9 +27,14 @@ class StreamMapNetEncoderLayer(BEVEncoderLayer):
         self.mirrored = mirrored
 
     def centres(self, grid: BEVGrid, device: torch.device) -> Tensor:
-        """Reference points (x, y) of the self-attention of the cells, [0, 1] over the map.
+        """Return the reference points (x, y) of the cells' self-attention.
 
-        (H, W, 2)
+        Args:
+            grid: Extent and cells of the map.
+            device: Device of the result.
+
+        Returns:
+            Reference points in [0, 1] over the map. (H, W, 2)
         """
         centres = super().centres(grid, device)
         return centres.flip(0) if self.mirrored else centres
@@ -36,7 +42,7 @@ class StreamMapNetEncoderLayer(BEVEncoderLayer):
 
 @MODELS.register_module()
 class StreamMapNetEncoder(BEVQueryEncoder):
-    """`BEVQueryEncoder` without the vehicle's motion (StreamMapNet).
+    """`BEVQueryEncoder` that does not receive the vehicle's motion (StreamMapNet).
 
     Inside the encoder, row 0 is at the largest y, as in the released weights. Row 0 of its output
     is at the smallest y, as in all encoders.
@@ -44,8 +50,8 @@ class StreamMapNetEncoder(BEVQueryEncoder):
     Args:
         num_levels: Number of levels of image features.
         layer_cfg: Settings of `StreamMapNetEncoderLayer`.
-        mirrored_self_attn: Whether the self-attention of each cell is centred at the row mirrored
-            at the middle of the map, as in the released code. The released weights require it.
+        mirrored_self_attn: Argument ``mirrored`` of the layers. True, as in the released code, is
+            required by the released weights.
         kwargs: Further arguments of `BEVQueryEncoder`.
     """
 

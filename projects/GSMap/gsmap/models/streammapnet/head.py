@@ -17,10 +17,10 @@ from gsmap.models.streammapnet.reference import LineReference
 
 
 class BestClassCoder(MapCoder):
-    """Coder that keeps each query with its best class."""
+    """Selects queries with their best class, so that no query occurs with two classes."""
 
     def best(self, scores: Tensor) -> Detections:
-        """Select the best queries, the highest score first. (N, classes)"""
+        """Select the best queries, the highest score first, from class logits (N, classes)."""
         best_scores, labels = scores.float().sigmoid().max(dim=-1)
         top_scores, order = best_scores.topk(min(self.max_num, len(best_scores)))
         return Detections(top_scores, labels[order], query_inds=order)
@@ -35,7 +35,7 @@ class StreamMapNetHead(MapHead):
         reference: Settings of `LineReference`.
         coder: Settings of `BestClassCoder`; by default it keeps all queries.
         num_points: Points per instance P.
-        embed_dims: Channels of the BEV features; the queries have twice as many.
+        embed_dims: Channels of the BEV features. The queries have twice this number.
         kwargs: Further arguments of `MapHead`.
     """
 
@@ -70,6 +70,6 @@ class StreamMapNetHead(MapHead):
     def queries(self) -> tuple[Tensor, Tensor]:
         """Return the query embeddings twice: for the initial lines, and as the decoder's input."""
         query = self.instance_embedding.weight
-        if not self.training:
+        if not self.training:  # later groups are used only in training
             query = query[: self.query_groups[0].num]
         return query, query

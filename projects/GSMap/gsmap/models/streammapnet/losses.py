@@ -53,7 +53,15 @@ class SmoothPointsCost(OrderedPointsCost):
         self.beta = beta
 
     def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
-        """Compute the distance of each coordinate. Two (..., P, 2 or 3) -> (..., P, 2 or 3)"""
+        """Compute the distance of each coordinate between two lists of points.
+
+        Args:
+            pts: Normalised points. (..., P, 2 or 3)
+            targets: Normalised points. (..., P, 2 or 3)
+
+        Returns:
+            Distances. (..., P, 2 or 3)
+        """
         return F.smooth_l1_loss(pts, targets, reduction="none", beta=self.beta)
 
     def __call__(

@@ -12,9 +12,9 @@ from gsmap.structures.tensors import in_float32
 
 @MODELS.register_module()
 class LineReference(PointReference):
-    """Points of a line in [0, 1] over the map, predicted by each layer without an offset.
+    """Points of a line in [0, 1] over the map, which each layer predicts directly.
 
-    All layers share one branch.
+    Layers do not predict offsets from the previous points. All layers share one prediction branch.
 
     Args:
         grid: Extent of the map, in metres.
@@ -36,7 +36,8 @@ class LineReference(PointReference):
         z_range: Sequence[float] | None = None,
         points_per_state: int = 1,
     ) -> None:
-        # The networks of the base class are replaced below: it creates them as small as possible.
+        # The networks of the base class are replaced below, so they are created as small as
+        # possible.
         super().__init__(
             grid,
             embed_dims=1,
@@ -59,7 +60,7 @@ class LineReference(PointReference):
         self.branches = nn.ModuleList([branch] * num_layers)
 
     def init_weights(self) -> None:
-        """Spread the first lines over the map, and initialise the branch with Xavier's method."""
+        """Initialise the first lines as in the base class, and the branch with Xavier's method."""
         super().init_weights()
         for parameter in self.branches.parameters():
             if parameter.dim() > 1:
@@ -69,8 +70,8 @@ class LineReference(PointReference):
         """Predict the lines of a layer.
 
         Args:
-            layer: Number of the layer.
-            point_states: States of the instances, each for all points of its line. (B, N, C)
+            layer: Index of the layer.
+            point_states: States of the instances, one for all points of a line. (B, N, C)
             reference: References of the previous layer; unused. (B, N * P, D)
 
         Returns:

@@ -16,7 +16,7 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class BEVMemory(nn.Module, AddsWeights):
-    r"""Fuse BEV features x with the warped memory h of the previous frame (Yuan et al. 2024).
+    r"""Fuses BEV features x with the warped memory h of the previous frame (Yuan et al. 2024).
 
     The output is the LayerNorm of :math:`(1 - z) h + z q` with :math:`z = \sigma(W_z [h, x])`,
     :math:`r = \sigma(W_r [h, x])` and :math:`q = W_q [r h, x]`, where W are 1 x 1 convolutions.
@@ -26,14 +26,14 @@ class BEVMemory(nn.Module, AddsWeights):
     Args:
         grid: Extent of the map.
         embed_dims: Channels C.
-        end_points: Place the cells from edge to edge of the map, as in the released code, instead
-            of at their centres. The memory is then resampled also if the vehicle does not move. The
-            released weights require it.
+        end_points: Whether the centres of the outermost cells are placed on the edges of the map,
+            as in the released code, instead of half a cell inside. The memory is then resampled
+            even if the vehicle does not move. The released weights require True.
         kept_dims: Number of channels to remember, from the first on. In the other channels, h is
             equal to x. None remembers all channels, as published.
-        present_share: Initialise as a mean of present and past, with z equal to this share, q = x
-            and no LayerNorm. A model that was trained without memory then keeps its features. None
-            initialises random weights, as published.
+        present_share: Value of z in (0, 1) for an initialisation as a weighted mean of present and
+            past, with q = x and no LayerNorm. A model that was trained without memory then keeps
+            its features. None initialises random weights, as published.
 
     Raises:
         ValueError: If ``kept_dims`` is not in [1, C] or ``present_share`` not in (0, 1).
@@ -62,7 +62,7 @@ class BEVMemory(nn.Module, AddsWeights):
         self.end_points = end_points
         self.kept_dims = kept_dims
         published = present_share is None
-        self.neutral_keys = () if published else ("conv",)  # a checkpoint may lack them
+        self.neutral_keys = () if published else ("conv",)  # a checkpoint may lack these weights
         self.convz = nn.Conv2d(2 * embed_dims, embed_dims, kernel_size=1, bias=not published)
         self.convr = nn.Conv2d(2 * embed_dims, embed_dims, kernel_size=1, bias=False)
         self.convq = nn.Conv2d(2 * embed_dims, embed_dims, kernel_size=1, bias=False)
@@ -107,13 +107,14 @@ class BEVMemory(nn.Module, AddsWeights):
             Locations for ``grid_sample``, [-1, 1] over the map. (B, H, W, 2)
         """
         cells = self.cells(height, width).to(motion)
-        rotation = motion[:, :2, :2].transpose(1, 2)  # cells are rows: multiplied from the right
+        # The cells are row vectors, so they are multiplied by the transposed rotation.
+        rotation = motion[:, :2, :2].transpose(1, 2)
         previous = cells.flatten(0, 1) @ rotation + motion[:, None, :2, 3]
         norm = self.grid.norm_from_metres(previous.unflatten(1, (height, width)))
         return 2 * norm - 1
 
     def warp(self, memory: Tensor, motion: Tensor) -> Tensor:
-        """Resample features of the previous frame to the cells of the current one.
+        """Resample features of the previous frame at the cells of the current frame.
 
         Args:
             memory: Features of the previous frame. (B, C, H, W)

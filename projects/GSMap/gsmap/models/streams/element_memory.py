@@ -22,17 +22,17 @@ PREFIX = "element_"  # begins the names of remembered elements in the memory of 
 class ElementMemory:
     """Update of detections by the elements of the previous frame (`update_from_known_lines`).
 
-    The previous elements are transformed by the ego motion, and their covariances grow by its
-    noise. There are no weights and there is no training, so any trained model with Gaussians can
-    use it. It is not part of a published method.
+    The previous elements are transformed by the ego motion, and their covariances grow by the noise
+    of the motion. The update has no weights and needs no training, so any trained model with
+    Gaussians can use it. It is not part of a published method.
 
     Args:
         head: Head of the detector; its detections have ``scales`` and ``rotations``.
         gate_m: Largest distance between a detection and a previous element that match, in metres.
         min_score: Smallest score of elements that are updated and remembered.
-        noise_m: Standard deviation of the ego translation after one second, in metres. The variance
-            grows with time.
-        noise_deg: Standard deviation of the ego heading after one second, in degrees.
+        noise_m: Standard deviation of the error of the ego translation after one second, in metres.
+            The variance is proportional to the time.
+        noise_deg: Standard deviation of the error of the ego heading after one second, in degrees.
 
     Raises:
         ValueError: If the head has no Gaussians, or a setting is out of range.
@@ -123,7 +123,7 @@ class ElementMemory:
         return result
 
     def remember(self, results: Sequence[InstanceData]) -> dict[str, Tensor]:
-        """Memory of the detections of a batch, padded with zeros and with label -1.
+        """Return the memory of a batch: its confident detections, padded with zeros and label -1.
 
         Args:
             results: Detections of each sample.

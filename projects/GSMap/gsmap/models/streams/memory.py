@@ -22,8 +22,9 @@ from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamStat
 from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError
 
-# Values whose name has one of these prefixes are stored in single precision: they hold coordinates,
-# in which half precision has errors of centimetres. `PREFIX` begins the names of `ElementMemory`.
+# Values whose name has one of these prefixes are stored in single precision. They are coordinates,
+# for which half precision has errors of centimetres. The names of `ElementMemory` begin with
+# `PREFIX`.
 _SINGLE_PRECISION_PREFIXES = ("references", "targets", PREFIX)
 
 
@@ -32,13 +33,13 @@ class BatchMemory:
     """Encoder outputs of a batch, the memory recalled for them, and the detections to store.
 
     Args:
-        outputs: Outputs of the encoder, in which ``bev_feats`` (B, C, H, W) are fused with the
-            memory.
+        outputs: Outputs of the encoder. Their ``bev_feats`` (B, C, H, W) are fused with the memory.
         past: Memory of the previous frames and the ego motion since then, or None if nothing was
             recalled.
         propagation: Hook that adds the memory of queries to the head, or None.
         elements: Detections to store for the next frame, by name. (B, ...) each
-        further_hooks: Hooks that are called before the propagation, such as the one of a map prior.
+        further_hooks: Hooks that are called before ``propagation``, such as the hook of a map
+            prior.
     """
 
     outputs: dict[str, Any]
@@ -49,7 +50,7 @@ class BatchMemory:
 
     @property
     def hooks(self) -> dict[str, tuple[FlowHook, ...]]:
-        """Keyword arguments of the head: ``hooks``, or none if there is no hook."""
+        """Keyword arguments of the head: ``hooks``, or an empty dictionary without hooks."""
         hooks = self.further_hooks
         if self.propagation is not None:
             hooks = (*hooks, self.propagation)
@@ -57,24 +58,25 @@ class BatchMemory:
 
 
 class StreamMemory(BaseModule):
-    """Memory of a `MapDetector`: one state per stream, transformed by the poses of the samples.
+    """Memory of a `MapDetector`: one state per stream, a sequence of frames.
 
-    In training, a stream consists of the samples at one index of the batch (`Slots`). In testing,
-    it is a scene (`Scenes`), and every scene starts with an empty memory. The metainfo of a sample
-    needs ``scene``, ``timestamp_ns`` and ``lidar2global``.
+    The states are transformed to the current frame by the poses of the samples. In training, a
+    stream consists of the samples at one index of the batch (`Slots`). In testing, it is a scene
+    (`Scenes`), and every scene starts with an empty memory. The metainfo of a sample needs
+    ``scene``, ``timestamp_ns`` and ``lidar2global``.
 
     Args:
         head: Head of the detector. It must be a `MapHead` if ``queries`` is given.
-        bev: Settings of `BEVMemory`, or None without memory of BEV features.
-        queries: Settings of `QueryMemory`, or None without memory of queries.
-        elements: Settings of `ElementMemory`, or None without memory of elements.
+        bev: Settings of `BEVMemory`, or None for no memory of BEV features.
+        queries: Settings of `QueryMemory`, or None for no memory of queries.
+        elements: Settings of `ElementMemory`, or None for no memory of elements.
         embed_dims: Channels of the BEV features.
-        max_gap_s: Longest pause between two frames of a stream, in seconds. After a longer one the
-            stream restarts.
+        max_gap_s: Longest pause between two frames of a stream, in seconds. After a longer pause
+            the stream restarts.
         half: Store features in half precision; coordinates keep single precision.
 
     Attributes:
-        name: Description of the model for error messages: "a model with MapHead".
+        name: Description of the model for error messages, such as "a model with MapHead".
 
     Raises:
         ValueError: If ``bev``, ``queries`` and ``elements`` are all None, if one of them does not
@@ -171,7 +173,7 @@ class StreamMemory(BaseModule):
         """
         has_trained_memory = self.bev is not None or self.queries is not None
         if self.training and not has_trained_memory:
-            # The memory of elements is unused in training: samples need no poses.
+            # The memory of elements is not used in training, so the samples need no poses.
             yield BatchMemory(outputs)
             return
         frames = [Frame.from_meta(meta) for meta in metas]
@@ -232,7 +234,8 @@ class StreamMemory(BaseModule):
             memory |= batch.propagation.collect_memory()
         if self.half:
             for name, values in memory.items():
-                if not name.startswith(_SINGLE_PRECISION_PREFIXES):
+                is_coordinate = name.startswith(_SINGLE_PRECISION_PREFIXES)
+                if not is_coordinate:
                     memory[name] = values.half()
         return memory
 
@@ -240,7 +243,7 @@ class StreamMemory(BaseModule):
 def stack_past(
     frames: Sequence[Frame], states: Sequence[StreamState | None], device: torch.device
 ) -> Past:
-    """Stack the stream states of a batch, with zeros where a stream starts.
+    """Stack the stream states of a batch. The memory of a stream that starts is zeros.
 
     Args:
         frames: The frames of the batch.

@@ -1,4 +1,4 @@
-"""Memory of queries: the best queries of a frame enter the decoder of the next one."""
+"""Memory of queries: the best queries of a frame are added to the decoder of the next frame."""
 
 from typing import Any
 
@@ -31,8 +31,9 @@ class QueryMemory(BaseModule, AddsWeights):
     Args:
         embed_dims: Channels C of the queries.
         num: Number K of propagated queries.
-        loss_weight: Weight of the loss, as published 0.1 times the weight 50 of the points.
-        beta: Distance below which smooth L1 is quadratic, as a fraction of the map.
+        loss_weight: Weight of the loss. The default is the published value: 0.1 times 50, which is
+            the weight of the points loss.
+        beta: Distance below which the smooth L1 loss is quadratic, as a fraction of the map.
     """
 
     neutral_keys = ("fc.",)  # a checkpoint without the network can be loaded, see `init_weights`
@@ -52,7 +53,7 @@ class QueryMemory(BaseModule, AddsWeights):
         )
 
     def init_weights(self) -> None:
-        """Initialise the network so that it hardly changes a state: matrices are 0, biases stay."""
+        """Initialise the network so that it hardly changes a state: all matrices are set to 0."""
         super().init_weights()
         for layer in self.fc:
             if isinstance(layer, nn.Linear):
@@ -118,14 +119,14 @@ class QueryMemory(BaseModule, AddsWeights):
 
 
 def by_instance(leaf: Tensor, num: int) -> Tensor:
-    """Group queries by instance. (B, Q, ...) -> (B, num, Q / num, ...)"""
+    """Group queries by ``num`` instances. (B, Q, ...) -> (B, num, Q / num, ...)"""
     return leaf.unflatten(1, (num, -1))
 
 
 def leaf_names(count: int) -> list[str]:
-    """Names under which the memory stores the leaves of `Queries`, as `tree_flatten` lists them.
+    """Return the names of stored leaves, the tensors that `tree_flatten` lists for `Queries`.
 
-    The leaves are the tensors of the state and of the position, and the references as the last one.
+    The last leaf is the references. The others are the tensors of the state and of the position.
     """
     return [*(f"queries_{number}" for number in range(count - 1)), "references"]
 
@@ -137,7 +138,7 @@ def pick(values: Tensor, order: Tensor) -> Tensor:
 
 
 class Propagation(FlowHook):
-    """Memory of queries in one batch: propagation into the decoder, and storage of the best.
+    """Memory of queries in one batch: propagation to the decoder, and storage of the best queries.
 
     Args:
         memory: Settings and network.
@@ -153,7 +154,7 @@ class Propagation(FlowHook):
         self.last: Queries | None = None  # after the last layer
         self.num_queries = 0  # number N of instance queries of all groups
         self.best_inds: Tensor | None = None  # indices of the queries to remember (B, K)
-        # Target of each query of the first group, 0 for a query without a match.
+        # Target points of each query of the first group; zeros for a query without a match.
         # (B, queries of this group, P, 2 or 3)
         self.target_pts: Tensor | None = None
 
@@ -166,7 +167,7 @@ class Propagation(FlowHook):
             refined: References of the layer. (B, N * P, D)
 
         Returns:
-            References. (B, N * P, D)
+            References, with the fused ones of propagated queries. (B, N * P, D)
         """
         if layer < len(head.decoder.layers) - 1 or self.propagated is None:
             return refined
@@ -196,9 +197,10 @@ class Propagation(FlowHook):
         return queries
 
     def insert(self, head: FlowHead, queries: Queries) -> Queries:
-        """Replace the weakest queries by the propagated ones, which come first.
+        """Replace the weakest queries of the first group by the propagated queries.
 
-        Streams that start, and the further query groups of training, keep their queries.
+        The propagated queries come first. A stream that starts keeps all its queries, and so do the
+        further query groups of training.
         """
         decoded = head.decoder.read(queries.state, queries.reference)
         total = decoded.instance_states.shape[1]
@@ -206,8 +208,8 @@ class Propagation(FlowHook):
         with torch.no_grad():
             scores = head.cls_branches[0](decoded.instance_states[:, :group_size]).amax(-1)
         order = self.order(scores, total)
-        # A state may be a nested tuple. Its leaves are tensors, except for numbers such as 0.0 in
-        # place of a tensor, which need no memory.
+        # A state may be a nested tuple. Its leaves are tensors or, in place of a tensor, a number
+        # such as 0.0. Numbers are not stored in the memory.
         leaves, form = tree_flatten(queries)
         remembered = []
         for name, leaf in zip(leaf_names(len(leaves)), leaves, strict=True):
@@ -225,7 +227,7 @@ class Propagation(FlowHook):
         return tree_unflatten(merged, form)
 
     def order(self, scores: Tensor, total: int) -> Tensor:
-        """Order of the queries of the next layer.
+        """Return the order of the queries of the next layer.
 
         Args:
             scores: Largest class logit of the queries of the first group. (B, N of the group)
@@ -236,7 +238,7 @@ class Propagation(FlowHook):
         """
         num = self.memory.num
         group_size = scores.shape[1]
-        # Indices below `num` are of propagated queries, so current query i has the index num + i.
+        # The propagated queries have the indices 0 to num - 1, and current query i has num + i.
         survivors = scores.topk(group_size - num).indices + num
         propagated = torch.arange(num, device=scores.device).expand(len(scores), -1)
         unchanged = torch.arange(num, num + group_size, device=scores.device)
@@ -250,7 +252,7 @@ class Propagation(FlowHook):
         leaves, form = tree_flatten(queries.state)
         states = []
         for leaf in leaves:
-            # Leaves with another number of channels are no states, such as sampling locations.
+            # Leaves with another number of channels, such as sampling locations, are not states.
             if isinstance(leaf, Tensor) and leaf.shape[-1] == head.embed_dims:
                 leaf = self.memory.update(leaf, self.past.now_from_then)
             states.append(leaf)
@@ -274,11 +276,14 @@ class Propagation(FlowHook):
         self.target_pts = targets
 
     def losses(self, head: FlowHead, truths: GroundTruth) -> dict[str, Tensor]:
-        """Transformation loss of the propagated queries, by name."""
+        """Return the transformation loss of the propagated queries, by name."""
         return {"loss_trans": self.loss(head)}
 
     def collect_memory(self) -> dict[str, Tensor]:
-        """Memory for the next frame, best query first, by name. (B, K, rows, ...) each"""
+        """Collect the memory for the next frame, by name. (B, K, rows, ...) each
+
+        The K queries are in the order of falling scores.
+        """
         assert self.last is not None
         assert self.best_inds is not None
         leaves, _ = tree_flatten(self.last)
@@ -292,9 +297,11 @@ class Propagation(FlowHook):
         return memory
 
     def loss(self, head: FlowHead) -> Tensor:
-        """Transformation loss (Yuan et al. 2024): smooth L1 to the transformed previous targets.
+        """Compute the transformation loss (Yuan et al. 2024).
 
-        It is 0 with a gradient of 0 if no stream continues.
+        It is the smooth L1 distance between the refined references of the propagated queries and
+        the transformed targets of the previous frame. If no stream continues, it is 0 with a
+        gradient of 0.
         """
         previous = self.past.memory.get("targets")  # (B, K, P, 2 or 3)
         if self.propagated is None or previous is None:
@@ -308,10 +315,10 @@ class Propagation(FlowHook):
             point_states=head.decoder.point_states(state),
             reference=self.propagated.reference.flatten(1, 2),
         )
-        # Coordinates are the first entries of a reference: (B, K * P, D) -> (B, K, P, 2 or 3).
+        # The first entries of a reference are its coordinates. (B, K * P, D) -> (B, K, P, 2 or 3)
         pred = pred[..., : previous.shape[-1]].reshape(previous.shape)
         target = head.reference.transform_points(previous, self.past.now_from_then)
-        has_target = (previous.flatten(2) != 0).any(-1)  # unmatched queries have zeros (B, K)
+        has_target = (previous.flatten(2) != 0).any(-1)  # (B, K); unmatched queries have zeros
         weight = has_target & self.past.continues[:, None]
         distances = F.smooth_l1_loss(pred, target, reduction="none", beta=self.memory.beta)
         num_points = previous.shape[-2]

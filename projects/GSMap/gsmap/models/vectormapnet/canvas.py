@@ -43,7 +43,7 @@ class Canvas:
 
     @property
     def steps(self) -> tuple[int, int]:
-        """Steps from the first pixel to the last along x and y."""
+        """Numbers of steps from the first pixel to the last along x and y."""
         return self.size[0] - 1, self.size[1] - 1
 
     @property

@@ -1,4 +1,4 @@
-"""VectorMapNet's element detector: map elements as key points, the corners of their boxes."""
+"""VectorMapNet's element detector, which predicts key points: the two corners of element boxes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
-_CORNERS = 2
+_CORNERS = 2  # corners per box
 
 
 class BEVEmbedding(nn.Module):
@@ -51,7 +51,9 @@ class BEVEmbedding(nn.Module):
 
 
 class KeyPointLayer(nn.Module):
-    """Decoder layer: self-attention of key points, attention to the map, feed-forward; pre-norm.
+    """Decoder layer: self-attention of key points, attention to the map, feed-forward network.
+
+    The states are normalised before each of the three parts (pre-norm).
 
     Args:
         embed_dims: Channels C of the key points and of the map.
@@ -101,8 +103,9 @@ class KeyPointReference(Reference):
     canvas: Canvas
 
     def decode(self, references: Tensor) -> Tensors:
-        """Decode corners in pixels (N, 2, 2) to ``pts``, both corners in metres. (N, 2, 2)"""
-        return {"pts": self.canvas.metres_from_norm(references / self.size(references))}
+        """Convert corners from pixels (N, 2, 2) to metres, named ``pts``. (N, 2, 2)"""
+        corners_norm = references / self.size(references)
+        return {"pts": self.canvas.metres_from_norm(corners_norm)}
 
     def size(self, like: Tensor) -> Tensor:
         """Return the numbers of pixels along x and y with the device and type of a tensor. (2,)"""
@@ -120,7 +123,8 @@ class KeyPointPredictions(NamedTuple):
 class KeyPointHead(DetectionHead):
     """Head that detects map elements as two corners of their boxes (VectorMapNet's first stage).
 
-    A detection is a line from one corner to the other. `FormatPolylineTargets` adds the targets.
+    A detection is returned as a line from one corner to the other. The transform
+    `FormatPolylineTargets` adds the training targets to the samples.
 
     Args:
         grid: Extent of the map, in metres.
@@ -191,7 +195,7 @@ class KeyPointHead(DetectionHead):
         self.giou_weight = giou_weight
 
     def init_weights(self) -> None:
-        """Initialise matrices with Xavier's method and the class bias at a probability of 1 %."""
+        """Initialise matrices with Xavier's method, and the class bias for probabilities of 1 %."""
         super().init_weights()
         for module in (self.layers, self.context, self.initial):
             init_matrices(module)
@@ -203,7 +207,7 @@ class KeyPointHead(DetectionHead):
         return dict(settings["canvas"] or {})
 
     def forward(self, bev_outputs: Tensors) -> list[KeyPointPredictions]:
-        """Predict the elements after every layer from ``bev_feats``. (B, C', H, W)"""
+        """Predict elements from ``bev_feats`` (B, C', H, W), once per decoder layer."""
         context = self.context(bev_outputs["bev_feats"])
         embeddings = self.elements.weight[:, None] + self.corners.weight  # (N, 2, 2 C)
         embeddings = embeddings.flatten(0, 1).expand(len(context), -1, -1)  # (B, N * 2, 2 C)
@@ -265,7 +269,7 @@ class KeyPointHead(DetectionHead):
             tokens: Name (``token``) of each sample, for error messages. (B,)
 
         Returns:
-            Weighted scalars, averaged over the matched elements of the batch.
+            Both losses as weighted scalars, averaged over the matched elements of the batch.
         """
         scores = output.scores.float()
         boxes = output.references.float().flatten(2)
@@ -330,7 +334,7 @@ class KeyPointHead(DetectionHead):
 
 
 def get_targets(sample: Det3DDataSample, canvas: Canvas) -> InstanceData:
-    """Return the targets of `FormatPolylineTargets` of a sample.
+    """Return the targets that `FormatPolylineTargets` has added to a sample.
 
     Args:
         sample: Training sample.

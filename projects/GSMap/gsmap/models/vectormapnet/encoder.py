@@ -21,7 +21,7 @@ from gsmap.utils.errors import InputError
 class HeightPlanesEncoder(CameraEncoder):
     """BEV encoder that averages the image features of all cameras at points of horizontal planes.
 
-    The features and the coordinates x, y, z of the points of all planes are concatenated along the
+    The features and coordinates (x, y, z) of the points of all planes are concatenated along the
     channels. A convolution and a neck of stride 4 reduce the result to BEV features.
 
     Args:
@@ -145,8 +145,8 @@ class HeightPlanesEncoder(CameraEncoder):
         num_planes, height, width = self.planes.shape[1:]
         visible = projection.visible  # (B, V, Q)
         uv = 2 * projection.uv[..., 0, :] - 1  # [-1, 1] over the image, (B, V, Q, 2)
-        # Projections of invisible points may have any value, also NaN. Beyond the image, such as at
-        # -2, `grid_sample` returns 0.
+        # Projections of invisible points may have any value, even NaN. They are set to -2, a place
+        # beyond the image, where `grid_sample` returns 0.
         uv = uv.where(visible[..., None], -2.0)
         total = feats.new_zeros(())
         for view in range(feats.shape[1]):

@@ -21,7 +21,7 @@ Draw = Callable[[Tensor], Tensor]  # samples tokens (n, t) from probabilities (n
 
 
 class Elements(NamedTuple):
-    """Classes and boxes of one sample, for each of which a line is generated."""
+    """Classes and boxes of the elements of one sample; a line is generated for each element."""
 
     labels: Tensor  # class indices (n,)
     boxes: Tensor  # x0, y0, x1, y1 in whole pixels of the canvas, used as tokens (n, 4)
@@ -42,12 +42,12 @@ class PolylineGenerator(BaseModule):
         top_p: Tokens are sampled from the smallest set of most likely tokens with at least this
             total probability, in [0, 1]. 0 takes the most likely token.
         max_points: Largest number of points of a generated line, >= 2.
-        redraw: Whether every step samples all earlier tokens again. The released code does so. The
-            new samples are inputs of the first layer only; the line keeps the first samples.
+        redraw: Whether every step samples all earlier tokens again, as in the released code. The
+            new samples are inputs of the first layer only; the line consists of the first samples.
         noise_share: Share in [0, 1] of the coordinates that receive noise in training.
         noise_px: Standard deviations of the noise along x and y, in pixels.
-        box_noise_by_x: Whether noise replaces the y of a box corner by its x, which is an error of
-            the released code.
+        box_noise_by_x: Whether a y of a box corner that receives noise is replaced by the noisy x
+            of the corner, which is an error of the released code.
         num_positions: Largest number of points of an annotated line.
         shrunk_results: Whether tokens are converted to metres as if the canvas had no margin, which
             shrinks the lines. The released code shrinks predicted and annotated lines in this way.
@@ -297,7 +297,8 @@ class PolylineGenerator(BaseModule):
         caches: list[Cache | None] = [None] * len(self.layers)
         # Probabilities of all tokens so far with `redraw`, otherwise of the last token alone.
         all_probs = condition.new_zeros(len(tokens), 0, self.canvas.num_tokens)
-        states = condition  # new inputs of a step: the condition, then the previous token
+        # New inputs of a step: the condition in the first step, later the previous token.
+        states = condition
         for step in range(num_steps):
             for i, layer in enumerate(self.layers):
                 cache = append_cache(caches[i], layer.keys_values(states))
@@ -362,7 +363,7 @@ def causal_mask(num_tokens: int, device: torch.device) -> Tensor:
     A token attends to itself and to earlier tokens; condition tokens attend to each other.
 
     Args:
-        num_tokens: Number S of tokens, with the tokens of the condition.
+        num_tokens: Number S of tokens, including the tokens of the condition.
         device: Device of the mask.
 
     Returns:

@@ -140,7 +140,7 @@ class VectorMapNetHead(DetectionHead):
     def generate_lines(
         self, feats: Tensor, detections: InstanceData, meta: Mapping[str, object]
     ) -> InstanceData:
-        """Generate the lines of one sample's elements. The name of the sample is the random seed.
+        """Generate the lines of one sample's elements, with a random seed from the sample's name.
 
         Args:
             feats: BEV features of the sample. (C', H, W)
@@ -168,7 +168,7 @@ class VectorMapNetHead(DetectionHead):
     def boxes(self, detections: InstanceData) -> Tensor:
         """Return the boxes of elements, x0, y0, x1, y1 in whole pixels of the canvas. (n, 4)"""
         corners = self.canvas.norm_from_metres(detections.pts[..., :2])
-        # The points of a `KeyPointHead` are two opposite corners of a box already.
+        # The points of a `KeyPointHead` are already two opposite corners of a box.
         if not isinstance(self.detector, KeyPointHead):
             corners = torch.stack([corners.amin(dim=1), corners.amax(dim=1)], dim=1)
         size = constant(corners, self.canvas.size)  # a tensor on the device of `corners`

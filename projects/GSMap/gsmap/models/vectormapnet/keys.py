@@ -2,8 +2,8 @@
 
 The first two arguments of `rules_of` are the prefixes of keys in the release and here. The text
 lists the rest of each key, as ``released=here`` or as one name that both have.
-`zeros` lists keys of the release that have no effect there, and no counterpart here. The value of
-an unused key is written when weights are converted to the release; a key with None is not written.
+`zeros` lists keys of the release that have no effect there and no counterpart here. When weights
+are converted to the release, the values in ``unused`` are written; a key with None is not written.
 """
 
 import torch
@@ -58,20 +58,22 @@ VECTORMAPNET = KeyMap(
         ),
     ),
     unused={
-        # settings: points (x, y, z) of the planes, pixels of the canvas, two settings of the noise
+        # buffers with settings: the points (x, y, z) of the planes, the size of the canvas in
+        # pixels, and two settings of the noise
         "backbone.bev_planes": torch.stack((_PLANES[2], _PLANES[1], _PLANES[0]), -1),
         _ELEMENTS + "canvas_size": torch.tensor((200, 100)),
         _LINES + "canvas_size": torch.tensor((200, 100)),
         "head.augmentation.canvas_size": torch.tensor((200, 100)),
         "head.augmentation.shift_scale": None,
         "head.augmentation.scaling_size": None,
-        # parameters without effect: an unused table, embeddings of the only level and of the labels
+        # parameters without effect: an unused table, and embeddings of the only level and of the
+        # labels
         "backbone.masked_embeds.weight": torch.zeros(()).expand(4, 128),
         **zeros(_ELEMENTS, {"transformer.level_embeds": (1, 256), "label_embed.weight": (3, 256)}),
     },
     # prefixes, in the release and here, that identify the architecture
     markers=((_LINES, "map_head.generator."),),
-    # the released branches of index 1 and higher are the branch of index 0 under further names
+    # in the release, the branches of index 1 and higher are further names of the branch of index 0
     ignored_pattern=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",
     upstream_prefix=_LINES,
 )

@@ -10,7 +10,7 @@ Cache = tuple[Tensor, Tensor]  # keys and values, split by head (n, heads, S, C 
 class CachedAttention(nn.MultiheadAttention):
     """Multi-head attention to keys and values that are computed in advance.
 
-    Takes the arguments of `torch.nn.MultiheadAttention`.
+    The arguments are described in `torch.nn.MultiheadAttention`.
     """
 
     def keys_values(self, tokens: Tensor) -> Cache:
@@ -97,7 +97,7 @@ class GatedLayer(nn.Module):
         """
         attention_output = self.self_attn(self.norms[0](states), cache, mask=mask)
         states = states + self.gates[0] * self.dropout(attention_output)
-        # As the memory is shared, the tokens of all lines attend to it as one sequence.
+        # The memory is shared, so the tokens of all lines attend to it as one sequence.
         query = self.norms[1](states).flatten(0, 1)[None]  # (1, n * T, C)
         attention_output = self.cross_attn(query, memory).view(states.shape)
         states = states + self.gates[1] * self.dropout(attention_output)

@@ -25,7 +25,7 @@ def bounding_box(line: Floats, smallest: float) -> Floats:
     """Compute the bounding box of a line, enlarged on all sides if its shorter side is too small.
 
     Args:
-        line: Vertices in [0, 1] over the canvas. (n, 2)
+        line: Vertices in [0, 1] over the canvas, the raster of the tokens. (n, 2)
         smallest: Smallest length of the shorter side, in [0, 1].
 
     Returns:
@@ -48,9 +48,10 @@ def even_weights(line: Floats) -> Floats:
 
 
 def edge_weights(line: Floats) -> Floats:
-    """Compute token weights in proportion to the mean length of a point's two edges.
+    """Compute token weights of the points of a line in proportion to the length of their edges.
 
-    The weights of the coordinates sum to 1; the stop token has the weight 1 / (2 n).
+    The weight of a point is proportional to the mean length of its two edges, with half for x and
+    half for y. The weights of the coordinates sum to 1; the stop token has the weight 1 / (2 n).
 
     (n, 2) -> (2 n + 1,)
     """
@@ -59,8 +60,9 @@ def edge_weights(line: Floats) -> Floats:
     edge_before = np.append(edges[:1], edges)
     edge_after = np.append(edges, edges[-1:])
     means = (edge_before + edge_after) / 2
-    shares = means / max(means.sum(), np.finfo(float).eps) / 2  # half for x, half for y
-    return np.append(np.repeat(shares, 2), 1 / (2 * len(line)))
+    shares = means / max(means.sum(), np.finfo(float).eps)  # of each point
+    coordinate_weights = np.repeat(shares / 2, 2)  # half for x, half for y
+    return np.append(coordinate_weights, 1 / (2 * len(line)))
 
 
 @TRANSFORMS.register_module()
@@ -164,7 +166,10 @@ class StretchToPadding(BaseTransform):
     pad_size_divisor: int = 32
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Scale ``lidar2img``, and ``img_aug_matrix`` to preserve the mapping to the image file."""
+        """Scale ``lidar2img`` and ``img_aug_matrix``, if the sample has them.
+
+        With both scaled, the mapping from the LiDAR to the image file does not change.
+        """
         height, width = results["img_shape"]
         padded_height, padded_width = padded_size((height, width), self.pad_size_divisor)
         stretch = np.diag([padded_width / width, padded_height / height, 1.0, 1.0])

@@ -1,9 +1,9 @@
 """Pooling of lifted image features into bird's-eye-view cells (Lift, Splat, Shoot), in plain torch.
 
 A lifted point is one (pixel, depth) pair. Its feature is the probability of the depth times the
-context vector of the pixel. `bev_pool` builds the features of all points and is the reference.
-`bev_pool_conv3x3` treats each cell as a weighted bag of context vectors instead: memory grows with
-pixels + cells, and the forward pass is deterministic on every device.
+context vector of the pixel. `bev_pool` computes the features of all points and is the reference.
+`bev_pool_conv3x3` computes each cell directly as a weighted sum of context vectors. Its memory
+grows only with pixels + cells, and its forward pass is deterministic on every device.
 """
 
 import torch
@@ -18,8 +18,8 @@ from gsmap.utils.errors import InputError
 def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) -> Tensor:
     """Find the grid cell of each point.
 
-    Indices are truncated towards zero, as in the released code of Lift-Splat-Shoot: points up to
-    one cell below the lower edge count into index 0.
+    Indices are truncated towards zero, as in the released code of Lift-Splat-Shoot. Points up to
+    one cell below the lower edge therefore get index 0.
 
     Args:
         points_m: Points (x, y, z) in metres, in the frame of ``grid``. (..., 3)
@@ -46,7 +46,7 @@ def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) 
 
 
 def bev_pool(probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid) -> Tensor:
-    """Sum depth probability times context feature over the points of each cell.
+    """Sum the features (depth probability times context vector) of the points in each cell.
 
     Args:
         probs: Probability of each depth bin, in [0, 1]. (B, V, D, h, w)
@@ -64,7 +64,7 @@ def bev_pool(probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid) -> Te
     points = probs[..., None] * context.permute(0, 1, 3, 4, 2)[:, :, None]  # (B, V, D, h, w, C)
     num_cells = len(cells) * grid.height * grid.width
     bags = _bag_indices(cells, grid, outside=num_cells)
-    sums = context.new_zeros(num_cells + 1, context.shape[2])  # the last row: points outside
+    sums = context.new_zeros(num_cells + 1, context.shape[2])  # the last row is for points outside
     sums = sums.index_add(0, bags, points.flatten(0, 4))[:-1]
     return sums.view(len(cells), grid.height, grid.width, -1).permute(0, 3, 1, 2)
 
@@ -81,7 +81,7 @@ def bev_pool_conv3x3(
 
     Both steps are linear, so the nine matrices (O, C) of the filter can be applied to the few
     context vectors instead of the many cells. At a published size (2,250 pixels, 80,000 cells) this
-    is 35 times less arithmetic.
+    needs 35 times fewer operations.
 
     Args:
         probs: Probability of each depth bin, in [0, 1]. (B, V, D, h, w)
@@ -104,25 +104,29 @@ def bev_pool_conv3x3(
             f"weight must have shape (O, {context.shape[2]}, 3, 3) to match context, "
             f"got {tuple(weight.shape)}."
         )
-    exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # torch < 2.7
-    if fixed_sizes or exporting():  # ONNX can scatter sums but has no bags of several sizes
+    # torch < 2.7 has no `is_exporting`.
+    is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
+    # ONNX has no sums over bags of different sizes, but it has the scattered sums of `bev_pool`.
+    if fixed_sizes or is_exporting():
         pooled = bev_pool(probs, context, cells=cells, grid=grid)
         return F.conv2d(pooled, weight, padding=1)
+    # Pixel and probability of each point, sorted by cell, and number of points of each cell.
     pixels, probs, counts = _sort_by_cell(probs, cells, grid=grid)
+    # A tap is one of the nine positions of the filter. All taps are applied to all pixels.
     taps = weight.permute(1, 2, 3, 0).flatten(1)  # (C, 9 O)
     table = context.permute(0, 1, 3, 4, 2).flatten(0, 3) @ taps  # (B V h w, 9 O)
     table = table.view(-1, weight.shape[0])  # row = pixel * 9 + tap
     starts = counts.flatten().cumsum(0).view_as(counts) - counts  # first point of each cell
     # An output cell sums the points of its 3 x 3 neighbours, in the order of the filter's taps. The
-    # points of one neighbour are successive sorted points. Their number and the index of the first
-    # one, for each output cell and neighbour r, (B H W 9,):
+    # points of one neighbour are successive in the sorted order. For each pair r of an output cell
+    # and a neighbour, these are the number of points and the index of the first point. (B H W 9,)
     lengths = _neighbours(counts)
     firsts = _neighbours(starts)
-    # The points of all neighbours are written into one list, one neighbour after the other. The
-    # points of neighbour r begin at entry range_starts[r] of the list.
+    # The points of all pairs are written into one list, one pair after the other. The points of
+    # pair r begin at entry range_starts[r] of the list.
     total = int(lengths.sum())
     range_starts = lengths.cumsum(0) - lengths
-    # Entry i of the list, which belongs to a neighbour r, is the sorted point
+    # Entry i of the list, which belongs to a pair r, is the sorted point with the index
     # firsts[r] + (i - range_starts[r]) = i + shift[i].
     shift = torch.repeat_interleave(firsts - range_starts, repeats=lengths, output_size=total)
     tap = torch.repeat_interleave(
@@ -131,7 +135,8 @@ def bev_pool_conv3x3(
         output_size=total,
     )
     order = torch.arange(total, device=cells.device) + shift  # index of the sorted point
-    # `embedding_bag` sums over bags. A bag is the entries of the nine neighbours of an output cell.
+    # `embedding_bag` sums over bags. The bag of an output cell consists of the entries of its nine
+    # neighbours.
     bag_ends = lengths.view(-1, 9).sum(-1).cumsum(0)
     sums = F.embedding_bag(
         pixels[order] * 9 + tap,
@@ -167,7 +172,10 @@ def _check_shapes(probs: Tensor, context: Tensor, cells: Tensor) -> None:
 
 
 def _bag_indices(cells: Tensor, grid: BEVGrid, outside: int) -> Tensor:
-    """Cell of each point, counted over all samples. (B, V, D, h, w) -> (B V D h w,)"""
+    """Index of each point's cell among the cells of all samples; ``outside`` for other points.
+
+    (B, V, D, h, w) -> (B V D h w,)
+    """
     sample = torch.arange(len(cells), device=cells.device).view(-1, 1, 1, 1, 1)
     bags = cells + sample * (grid.height * grid.width)
     return torch.where(cells >= 0, bags, outside).flatten()

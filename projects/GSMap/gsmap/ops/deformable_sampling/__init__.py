@@ -38,7 +38,7 @@ def deformable_sample(
     """Sum weighted bilinear samples of a feature map for each head (Deformable DETR Eq. 2).
 
     The map is a table with one row of C channels per cell and head, and each output is a weighted
-    sum of its rows (`sum_rows`). There is no tensor of all the samples.
+    sum of its rows (`sum_rows`). No tensor of all samples is created.
 
     Args:
         value: Flattened feature map, row-major, float32 or half precision. (B, H * W, heads, C)
@@ -113,7 +113,7 @@ def bilinear_cells(
 
 
 def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto") -> Tensor:
-    """Sum weighted rows of a table, without a tensor of all the rows.
+    """Sum weighted rows of a table, without creating a tensor of all the selected rows.
 
     Args:
         table: Rows of C channels. (R, C)

@@ -2,9 +2,9 @@
 # mypy: disable-error-code="no-untyped-def"
 """Weighted sums of table rows on a CPU: torch's forward pass with a fused backward pass (numba).
 
-The backward pass of torch sorts all indices and walks the table twice. The backward pass here adds
-the gradient of each sum to the rows of the sum in order, in one thread, so repeated runs are equal
-to the bit.
+The backward pass of torch sorts all indices and goes through the table twice. The backward pass
+here adds the gradient of each sum to the rows of the sum in order, in one thread, so repeated runs
+are bitwise equal.
 """
 
 import torch

@@ -2,12 +2,12 @@
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels: deformable sampling of a map, forward and backward in one launch each.
 
-A row is the output of one head of one query, with all channels of the head. A program computes as
-many rows as fill ``BLOCK`` values. Sums are float32 for every dtype of the map. Cells outside of
-the map count as zero, and a NaN location makes only its row NaN.
+A row is the output of one head of one query, with all channels of the head. A program (an instance
+of a kernel) computes as many rows as fit into ``BLOCK`` values. Sums are float32 for every dtype of
+the map. Cells outside of the map count as zero. A NaN location makes only its row NaN.
 
-The gradient of the map is added by atomics in any order, so repeated runs differ in the last bits.
-No launch waits for the device, and nothing is autotuned.
+The gradient of the map is summed by atomic additions in any order, so repeated runs differ in the
+last bits. No launch waits for the device, and nothing is autotuned.
 """
 
 import torch
@@ -20,7 +20,7 @@ OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 @triton.jit
 def _locate_sample(locations, weights, sample, valid, height, width):
-    """Locate a sample among the centres of the four cells around it.
+    """Locate a sample relative to the centres of the four cells around it.
 
     Returns:
         Column and row of the upper left cell, distance of the sample from the centre of this cell
@@ -71,8 +71,8 @@ def _locate_rows(
         ROWS: Number of rows of a program.
 
     Returns:
-        Index of each row, whether it exists, and offset of its head's first value in the maps, all
-        (ROWS,); indices of the channels, and whether they exist, both (CP,).
+        Index of each row (ROWS,), whether the row exists (ROWS,), offset of the first value of its
+        head in the maps (ROWS,), indices of the channels (CP,), and whether they exist (CP,).
     """
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     batch = row // (queries * heads)
@@ -136,8 +136,8 @@ def forward_kernel(
             channel_offsets = pixel_offset[:, None] + channel[None, :]
             mask = inside[:, None] & is_channel[None, :]
             pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(tl.float32)
-            # A cell outside of the map has the weight 0. A NaN weight remains NaN in this product,
-            # but tl.where would replace it by 0.
+            # A cell outside of the map has the weight 0. It is set by a product, because tl.where
+            # would replace a NaN weight by 0.
             total += pixel * (corner_weight * inside.to(tl.float32))[:, None]
     out_pointers = out + row[:, None] * C + channel[None, :]
     tl.store(out_pointers, total, mask=valid[:, None] & is_channel[None, :])
@@ -227,7 +227,7 @@ def backward_kernel(
 
 
 def _plan_launch(value, weights):
-    """Number of rows, sizes that are constants of the compiled kernel, and grid of the programs."""
+    """Return the number of rows, the compile-time sizes of the kernel, and the grid of programs."""
     channels = value.shape[3]
     # At least 16, so that a program has at most BLOCK / 16 = 32 rows.
     padded_channels = max(16, triton.next_power_of_2(channels))

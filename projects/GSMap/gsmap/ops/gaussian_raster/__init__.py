@@ -17,7 +17,7 @@ _ARGUMENTS = "Tensor gaussians, float[] frame, int height, int width"
 
 
 def _masks_shape(gaussians: Tensor, frame: list[float], height: int, width: int) -> tuple[int, ...]:
-    """Shape of the masks of all instances, (N, H, W)."""
+    """Return the shape (N, H, W) of the masks of all N instances."""
     return len(gaussians), height, width
 
 
@@ -35,9 +35,9 @@ def render_gaussians(
 ) -> Tensor:
     r"""Render the 2D Gaussians of each map element to a soft occupancy raster.
 
-    A pixel :math:`p` takes :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6), where :math:`G_i(p)` is
-    the density of Gaussian i (Eq. 2). Computation is in the widest type of the inputs, at least
-    float32, also under autocast.
+    The value of a pixel :math:`p` is :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6). Here
+    :math:`G_i(p)` is the density of Gaussian i, which is 1 at its centre (Eq. 2). The computation
+    is in the widest type of the inputs, but at least in float32, even under autocast.
 
     Args:
         means: Centres (x, y) in metres, in the frame of ``grid``. (..., P, 2)
@@ -70,7 +70,7 @@ def render_gaussians(
         flat = gaussians.reshape(math.prod(batch_shape), means.shape[-2], 5)
         # Corner of the raster with the smallest x and y, and the sides of a pixel, in metres.
         frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
-        # If the user has enabled the kernel with one warp per tile, it replaces the other one.
+        # The kernel with one warp per tile replaces the default kernel if the user has enabled it.
         in_warps = backend == "triton" and "render_gaussians_in_warps" in backends.AUTO_KERNELS
         render = _render_in_warps if in_warps else _render
         masks = render(flat, frame, height=grid.height, width=grid.width, backend=backend)

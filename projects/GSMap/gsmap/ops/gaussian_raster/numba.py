@@ -25,7 +25,7 @@ these give the gradients:
     dL/dtheta = -M_uv (1 / s_u^2 - 1 / s_v^2).
 
 T and 1 - G are rounded identically in both passes, so their quotient stays exact near a centre.
-Results are equal to the bit for any number of threads, and for compiled and cached kernels.
+Results are bitwise equal for any number of threads, and for compiled and cached kernels.
 """
 
 import math
@@ -43,8 +43,8 @@ C0, C1, C2, C3, C4, C5 = map(
     np.float32, (1.0000001, 0.69314694, 0.24022122, 0.055507425, 0.00967546, 0.0013266971)
 )
 ZERO, HALF, ONE, LOWEST = map(np.float32, (0, 0.5, 1, -126))
-BIAS = np.int32(127)
-MANTISSA_BITS = np.int32(23)
+BIAS = np.int32(127)  # of the exponent of a float32
+MANTISSA_BITS = np.int32(23)  # of a float32
 MAX_DENSITY = np.float32(1 - 1e-6)
 HALF_LOG2E = 0.5 / math.log(2)
 LANES = 16  # pixels of a row that are computed at a time
@@ -57,7 +57,7 @@ def exp2_float32(x):
     whole = np.int32(x - HALF)  # rounded to the nearest, as x <= 0
     part = x - np.float32(whole)
     power = ((((C5 * part + C4) * part + C3) * part + C2) * part + C1) * part + C0
-    # The bits of a float32 with exponent field whole + BIAS and mantissa 0 are those of 2^whole.
+    # A float32 with the exponent field whole + BIAS and the mantissa 0 has the value 2^whole.
     return power * np.int32((whole + BIAS) << MANTISSA_BITS).view(np.float32)
 
 
@@ -123,7 +123,7 @@ def _accumulate(gaussian, frame, steps, mask, spans, parabolas, through):
     contains 0, 1, 2, .. times the width of a pixel in metres, and ``spans`` and ``parabolas`` are
     buffers for `_row_geometry`.
     """
-    size = mask.shape[0], mask.shape[1] - LANES
+    size = (mask.shape[0], mask.shape[1] - LANES)  # without the margin
     top, bottom, curvature, _, _ = _row_geometry(
         gaussian, frame, size=size, spans=spans, parabolas=parabolas
     )
@@ -156,15 +156,15 @@ def _row_sums(grad, steps, start, curvature, base):
     return sum_0, sum_1, sum_2
 
 
-# Inlined: otherwise the process that compiles it and those that load it from the cache can differ
-# in the last bit.
+# Inlined: otherwise the results of the process that compiles the function and of processes that
+# load it from the cache can differ in the last bit.
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", forceinline=True)
 def _gaussian_gradient(gaussian, frame, steps, grad, spans, parabolas, out):
     """Compute the gradient of one Gaussian (5,) from ``grad``, the product dL/dR * T.
 
     The other arguments are described in `_accumulate`.
     """
-    size = grad.shape[0], grad.shape[1] - LANES
+    size = (grad.shape[0], grad.shape[1] - LANES)  # without the margin
     top, bottom, curvature, cos, sin = _row_geometry(
         gaussian, frame, size=size, spans=spans, parabolas=parabolas
     )

@@ -17,10 +17,11 @@ which is 1 - prod (1 - G) and exact for small G.
 The backward pass computes the transmittance T = prod (1 - G) of the tile again and reads dL/dR
 once. As dR/dG = T / (1 - G), it sums w u, w v, w u^2, w u v and w v^2 for each Gaussian that meets
 the tile, with w = dL/dR * T * G / (1 - G). Each program writes its sums to separate entries of a
-buffer (N, tiles, P, 5). There are no atomics, so repeated runs are equal to the bit. Torch adds the
+buffer (N, tiles, P, 5). There are no atomics, so repeated runs are bitwise equal. Torch adds the
 sums of all tiles and computes the gradients from them.
 
-No launch waits for the device, nothing is autotuned, and TILE is the only size that is compiled in.
+No launch waits for the device, nothing is autotuned, and TILE is the only size that is a
+compile-time constant.
 
 There are two pairs of kernels. In the second pair (``warp_...``) a program is one warp with a
 smaller tile, and Gaussians that miss the tile are not visited: the boxes of 32 Gaussians are tested
@@ -48,7 +49,7 @@ MAX_DENSITY = tl.constexpr(1 - 1e-6)  # keeps 1 - G, by which the backward pass 
 
 @triton.jit
 def _tile_pixels(tile, x_min, y_min, step_x, step_y, height, width, TILE: tl.constexpr):
-    """Pixel centres x (1, TILE) and y (TILE, 1) of a tile, flat indices of its pixels, validity."""
+    """Pixel centres x (1, TILE) and y (TILE, 1) of a tile, flat indices, and whether they exist."""
     tiles_x = tl.cdiv(width, TILE)
     rows = (tile // tiles_x) * TILE + tl.arange(0, TILE)[:, None]
     cols = (tile % tiles_x) * TILE + tl.arange(0, TILE)[None, :]

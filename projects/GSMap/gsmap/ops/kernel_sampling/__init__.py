@@ -1,4 +1,4 @@
-"""Sampling of camera features by fixed kernels around projected points (GKT)."""
+"""Sampling of camera features at fixed pixel offsets (kernels) around projected points (GKT)."""
 
 import torch
 from torch import Tensor
@@ -18,8 +18,8 @@ _sample_kernels = fused_operator(
 
 
 def has_kernel(value: Tensor) -> bool:
-    """Whether ``backend="auto"`` of `sample_kernels` selects the Triton kernel for a map."""
-    like = at_least_float32(value[:0])  # without entries: only the device and the type count
+    """Whether `sample_kernels` with ``backend="auto"`` selects the Triton kernel for ``value``."""
+    like = at_least_float32(value[:0])  # an empty tensor, as only the device and the type matter
     return choose_backend("auto", like, fused=("triton",), kernel="sample_kernels") == "triton"
 
 
@@ -35,14 +35,14 @@ def sample_kernels(
 ) -> Tensor:
     """Sum weighted pixels around the projections of each BEV cell in the cameras.
 
-    Each output is the sum of V * S weighted pixels. The weight is zero for cameras to which the
-    cell is not visible. No size of a tensor depends on values, so the operation can be captured in
-    a CUDA graph.
+    Each output is the sum of V * S weighted pixels: S pixels in each of V cameras. The weight is
+    zero for cameras to which the cell is not visible. No tensor size depends on the values of
+    tensors, so the operation can be captured in a CUDA graph.
 
     Args:
         value: Flattened feature maps, row-major, float32 or half precision.
             (B, V, h * w, heads, C)
-        shape: Rows h and columns w of a map.
+        shape: Rows h and columns w of a feature map.
         uv: Projection (x, y) of each cell for each head, [0, 1] over the map; finite for visible
             cells. (B, V, Q, heads, 2)
         visible_cells: Whether a cell is visible to a camera, bool. (B, V, Q)

@@ -1,16 +1,16 @@
 # Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
-"""Triton kernels: weighted pixels at fixed offsets from projected points, forward and backward.
+"""Triton kernels that sum weighted pixels at fixed offsets from projected points, and gradients.
 
 The forward and the backward pass are one launch each. A row is the output of one head of one BEV
 cell, with all channels of the head. A program computes several neighbouring rows and loops over the
 cameras. If none of its cells is visible to a camera, a scalar branch skips the camera. Sums are
-float32 for every dtype of the maps.
+float32 for every dtype of the feature maps.
 
-Multiplications and additions are not fused: coordinates then have the rounding errors of plain
-torch, and are rounded to the same pixel. The gradient of the maps is added by atomics in any order,
-so repeated runs differ in the last bits. The gradient of the weights is accumulated in registers,
-and each entry of the gradient of the points is written by one program.
+Multiplications and additions are not fused. Coordinates then have the rounding errors of plain
+torch, and are rounded to the pixels that plain torch selects. The gradient of the maps is added by
+atomics in any order, so repeated runs differ in the last bits. The gradient of the weights is
+accumulated in registers, and each entry of the gradient of the points is written by one program.
 """
 
 import torch
@@ -20,7 +20,7 @@ import triton.language as tl
 from gsmap.ops.deformable_sampling.triton import BLOCK, find_corner
 
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": False}
-# 1.5 * 2^23: float32 has no fractions at this size, so adding and subtracting it rounds a number.
+# 1.5 * 2^23. Adding and subtracting it rounds a number, as float32 has no fractions at this size.
 ROUNDING = tl.constexpr(12582912.0)
 
 
@@ -284,7 +284,7 @@ def backward_kernel(
                         grad_value + channel_offsets, pixel_grad, mask=mask, sem="relaxed"
                     )
                     grad_weight += tl.sum(grad * pixel, axis=1)
-                # Add to column s, which cannot be indexed in a tensor of registers.
+                # Add to column s by a mask, because a tensor in registers cannot be indexed.
                 weight_grads += tl.where(samples[None, :] == s, grad_weight[:, None], 0.0)
             if BILINEAR:  # a rounded position has no gradient
                 tl.store(grad_uv + uv_offset, grad_x * width, mask=visible)

@@ -12,8 +12,8 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError
 
-# A line is rendered as a thin closed polygon, along the line and back. The way back is shifted by
-# this distance along x and y, as in the code of Zhang et al.
+# A line is rendered as a thin closed polygon that runs along the line and back. The way back is
+# shifted by this distance along x and along y, as in the code of Zhang et al.
 LANE_GAP_PX = 0.01
 DISTANCES = ("squared", "plain")
 # The lambda functions return the shape of the masks.
@@ -40,7 +40,8 @@ def draw_polylines(
 ) -> Tensor:
     """Draw masks of ground-truth polylines, without gradient.
 
-    A pixel takes the share of its area that the shape covers, measured across the nearest edge.
+    The value of a pixel is the share of its area that the shape covers, estimated from the distance
+    to the nearest edge.
 
     Args:
         polylines: Vertices in metres, in the frame of ``grid``. (K, P, 2)
@@ -100,9 +101,9 @@ def soft_rasters(
 ) -> Tensor:
     r"""Render lines as :math:`\exp(-D / \tau)`, polygons as :math:`\sigma(\pm D / \tau)`.
 
-    D is the distance of a pixel to the nearest edge, or its square. The sign is + inside of a
-    polygon (Zhang et al., Eqs. 2-3). A line is rendered as the thin closed polygon of the line and
-    its way back. The last vertex of a polygon is joined to the first one.
+    D is the distance of a pixel to the nearest edge, or the square of this distance. The sign is +
+    inside of a polygon (Zhang et al., Eqs. 2-3). A line is rendered as a thin closed polygon that
+    runs along the line and back. The last vertex of a polygon is joined to the first one.
 
     Args:
         vertices: Vertices in pixels (x = column, y = row); pixel (row, col) is sampled at
@@ -137,7 +138,8 @@ def soft_rasters(
         vertices = at_least_float32(vertices)
         # Differs from Zhang et al.'s Eqs. (2-3) by default: D is squared, as in their rasterizer.
         back = vertices.flip(1) + LANE_GAP_PX
-        stay = vertices[:, -1:].expand_as(vertices)  # pads a polygon with its last vertex
+        # Polygons are padded with their last vertex, so that all rings have 2 V vertices.
+        stay = vertices[:, -1:].expand_as(vertices)
         second_half = torch.where(flags[:, None, None], stay, back)
         rings = torch.cat([vertices, second_half], dim=1)  # (n, 2 V, 2)
         softness = [line_softness, polygon_softness]

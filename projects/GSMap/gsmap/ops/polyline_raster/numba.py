@@ -7,7 +7,7 @@ the edge are computed: beyond it a soft raster differs from 0 or 1 by less than 
 of a line is empty. Two buffers per thread, of the size of a mask, store the smallest squared
 distance of each pixel and the index of its nearest edge. There is no tensor per edge. The backward
 pass computes both again and adds the gradient of each pixel to the two ends of its nearest edge, in
-float64 and in a fixed order, so repeated runs are equal to the bit.
+float64 and in a fixed order, so repeated runs are bitwise equal.
 """
 
 import math
@@ -30,7 +30,7 @@ INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
 def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_indices):
-    """Update the squared distances and nearest edges of pixels (H, W) by one edge.
+    """Update the squared distances and nearest edges of pixels (H, W) with one more edge.
 
     ``columns`` contains 0, 1, .. W - 1 as float32.
     """
@@ -151,7 +151,11 @@ def _nearest_edges(ring, closed, filled, frame, reach, eps, buffers):
 
 @njit(inline="always")
 def _clamped_distance(squared, min_distance):
-    """D: the squared distance; if ``min_distance`` > 0, the distance, but at least this value."""
+    """Return D, from which a pixel of a soft raster is computed.
+
+    If ``min_distance`` is 0, D is the squared distance. Otherwise it is the distance, with
+    ``min_distance`` as its lower limit.
+    """
     return max(math.sqrt(squared), min_distance) if min_distance > 0 else float(squared)
 
 
@@ -197,9 +201,10 @@ def soft_forward(rings, polygons, reach, softness, min_distance, masks, first, l
                 if edge_indices[row, col] >= 0:
                     distance = _clamped_distance(distances[row, col], min_distance)
                     fade = math.exp(-distance / softness[kind])
+                value = fade
                 if kind:  # sigmoid(D / s) = 1 / (1 + fade), sigmoid(-D / s) = fade / (1 + fade)
-                    fade = (1.0 if inside[row, col] else fade) / (1 + fade)
-                masks[n, row, col] = fade
+                    value = (1.0 if inside[row, col] else fade) / (1 + fade)
+                masks[n, row, col] = value
 
 
 @njit(nogil=True, cache=True)

@@ -29,7 +29,10 @@ SHORTEST = tl.constexpr(1e-30)  # smallest squared length of an edge, which may 
 
 @triton.jit
 def _tile_pixels(height, width, TILE: tl.constexpr):
-    """Columns (1, TILE) and rows (TILE, 1) of a tile, flat indices of its pixels, validity."""
+    """Columns (1, TILE), rows (TILE, 1), flat indices and validity of the pixels of a tile.
+
+    The last two are (TILE, TILE). A pixel is valid if it lies in the raster.
+    """
     tiles_x = tl.cdiv(width, TILE)
     rows = (tl.program_id(0) // tiles_x) * TILE + tl.arange(0, TILE)[:, None]
     cols = (tl.program_id(0) % tiles_x) * TILE + tl.arange(0, TILE)[None, :]
@@ -51,9 +54,10 @@ def _ends(ring, edge, count):
 
 @triton.jit
 def _nearest_edges(ring, num_edges, count, x, y, eps, TILE: tl.constexpr):
-    """Squared distances to the nearest edges, their indices, the inside, and a term for NaN.
+    """Squared distance and index of the nearest edge of each pixel, inside flags, and a NaN term.
 
-    The term is added to the mask: it is NaN if a vertex is not finite, otherwise zero.
+    The flags are True for pixels inside of the ring. The term is a scalar that is added to the
+    mask: NaN if a vertex is not finite, otherwise zero.
     """
     nearest = tl.full((TILE, TILE), float("inf"), dtype=tl.float32)
     edge_index = tl.full((TILE, TILE), 0, dtype=tl.int32)
@@ -83,7 +87,7 @@ def _nearest_edges(ring, num_edges, count, x, y, eps, TILE: tl.constexpr):
 
 @triton.jit
 def _distance(squared, min_distance, PLAIN: tl.constexpr):
-    """Distance D that a mask fades with, from the squared distance of a pixel to its nearest edge.
+    """Distance D with which a mask fades, from the squared distance of pixels to the nearest edge.
 
     If PLAIN, D is the root of the squared distance, and at least ``min_distance``. Otherwise D is
     the squared distance itself.
@@ -194,7 +198,7 @@ def soft_backward_kernel(
     for first in range(0, count, CHUNK):
         bit = edge_index - first
         in_chunk = (weight != 0) & (bit >= 0) & (bit < CHUNK)
-        # One bit for the nearest edge of each pixel; no shift by a number outside of 0 to 31.
+        # One bit for the nearest edge of each pixel. The inner `where` keeps shifts in 0 to 31.
         pixel_bits = tl.where(in_chunk, 1 << tl.where(in_chunk, bit, 0), 0)
         row_bits = tl.reduce(pixel_bits, 1, combine_fn=_or)
         bits = tl.reduce(row_bits, 0, combine_fn=_or)

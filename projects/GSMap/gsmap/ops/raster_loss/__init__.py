@@ -19,7 +19,7 @@ _EPS = 1e-6
 _raster_loss_sums = fused_operator(
     "raster_loss.raster_loss_sums",
     "Tensor preds, Tensor targets, Tensor window, float weight",
-    lambda preds, *_: (len(preds), 7),  # seven sums per mask
+    lambda preds, *_: (len(preds), 7),  # shape of the output: seven sums per mask
     differentiable=1,  # the first tensor has a gradient
 )
 
@@ -41,9 +41,10 @@ def raster_loss(
     of:
 
     * ``"both"``: :math:`D_w = \sum w |R - R^*| / \sum w (R + R^*)`, and D-SSIM is the mean over the
-      pixels whose window covers part of either mask. A miss costs about 1 for any size of the
-      element and of the raster. If small Gaussians lie metres off their line, the gradient makes
-      them larger until they reach it, not smaller (`python -m benchmarks masks`).
+      pixels whose window covers part of either mask. A prediction that misses its element
+      costs about 1 for any size of the element and of the raster. If small Gaussians lie metres off
+      their line, the gradient makes them larger until they reach it, not smaller
+      (`python -m benchmarks masks`).
     * ``"foreground"``: :math:`D_w` is divided by :math:`\sum w R^*`, and D-SSIM by the number of
       pixels whose window covers part of R*. Both divisors are at least as large as for a mask
       that fills 0.5 % of the raster. If Gaussians lie 2 m off their line, the gradient makes them
@@ -111,7 +112,8 @@ def raster_loss(
             l1 = l1 / (predicted + foreground).clamp(min=_EPS)
             dissimilarity = dissimilarity / near_either.clamp(min=1)
         elif normalize == "foreground":
-            floor = MIN_FOREGROUND * pixels  # number of pixels; w is `foreground_weight` at each
+            # Smallest number of foreground pixels. Each of them has w = `foreground_weight`.
+            floor = MIN_FOREGROUND * pixels
             l1 = l1 / foreground.clamp(min=foreground_weight * floor)
             dissimilarity = dissimilarity / near_target.clamp(min=floor)
         else:

@@ -1,18 +1,18 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Fused CPU kernels (numba): the raster loss on the pixels that contribute to it.
+"""Fused CPU kernels (numba) of the raster loss, which visit only pixels that contribute to it.
 
-A thread computes one instance at a time. Where both masks are zero within SSIM's window, SSIM is
-exactly 1 and the L1 term exactly 0. In each row, every step therefore runs only from the first to
-the last column that can contribute: the columns where a mask is not zero, extended by the radius of
-the window for each blur. The window is separable and a row is blurred when it is needed, so no
-blurred map is stored.
+In this module, p is the predicted and t the ground-truth mask. A thread computes one instance at a
+time. Where both masks are zero within SSIM's window, SSIM is exactly 1 and the L1 term exactly 0.
+In each row, every step therefore runs only from the first to the last column that can contribute:
+the columns where a mask is not zero, extended by the radius of the window for each blur. The window
+is separable and a row is blurred when it is needed, so no blurred map is stored.
 
 Only the two masks are saved for the backward pass. It computes the four blurred maps (p, t,
 p^2 + t^2, p t) again and, from them, the derivatives of SSIM with respect to the blurred p, p^2 and
-p t. The gradient with respect to a map before its blur is the transposed blur of the derivative. As
-the window is symmetric, the transposed blur equals the blur: the derivatives are blurred once more.
-Sums run in a fixed order in one thread, so repeated runs are equal to the bit.
+p t. The gradient with respect to a map before its blur is the transposed blur of the derivative.
+The window is symmetric, so the transposed blur equals the blur, and the derivatives are blurred
+once more. Sums are computed in a fixed order in one thread, so repeated runs are bitwise equal.
 """
 
 import numpy as np
@@ -73,7 +73,8 @@ def _convolve(source, first, stride, window, out, size):
 
     The number of weights in ``window`` is a multiple of ``TAPS`` (6).
     """
-    # With signed indices, numba would test whether an index is negative and counts from the end.
+    # Indices are unsigned. For a signed index, numba would add a test whether it is negative and
+    # counts from the end.
     s_1 = np.uint64(stride)
     s_2 = np.uint64(2 * stride)
     s_3 = np.uint64(3 * stride)
@@ -114,8 +115,9 @@ def _blur_row(images, channels, row, span, window, line, out):
     """
     pitch = images.shape[1]
     pixels = span[1] - span[0]
-    # Index of the top left of the first pixel's window. It has the row and column that the first
-    # pixel has in the images without margin, since the margin is the radius of the window.
+    # Index of the top left of the first pixel's window. The margin is as wide as the window's
+    # radius, so the row and column of this corner in the padded images are equal to the row and
+    # column of the pixel in the images without margin.
     first = row * pitch + span[0] * channels
     # The blur along the row reads the whole windows of the first to the last pixel of the span.
     size = (pixels + len(window)) * channels
@@ -149,8 +151,8 @@ def _dissimilarity(maps, pixels):
             p, t, squares=maps[4 * k + 2], product=maps[4 * k + 3]
         )
         total += ONE - (top_mean * top_cov) / (low_mean * low_var)
-        # The two numbers have different thresholds, as in the reference: any part of the target
-        # counts, but the coverage by either mask must exceed `MIN_COVERAGE`.
+        # The two numbers have different thresholds, as in the reference: the blurred target must
+        # exceed 0, but the larger one of both blurred masks must exceed `MIN_COVERAGE`.
         near_target += 1.0 if t > 0 else 0.0
         near_either += 1.0 if max(p, t) > COVERAGE else 0.0
     return total, near_target, near_either
@@ -229,7 +231,7 @@ def _prepare_instance(preds, targets, weight, radius, products, spans, sums):
 
 @njit(nogil=True, cache=True)
 def _buffers(shape, taps):
-    """Buffers of a thread: products, derivatives, a row blurred once and twice, spans."""
+    """Buffers of a thread: products, derivatives, a row blurred along one and both axes, spans."""
     height = shape[0] + taps
     width = shape[1] + taps
     products = np.empty((height, 4 * width), np.float32)
@@ -279,7 +281,10 @@ def loss_forward(preds, targets, window, radius, weight, results, first, last):
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
 def _row_gradient(pred, target, maps, weight, factors, grad):
-    """Compute the gradient of the first three sums of a row, each times its factor."""
+    """Compute the gradient of a row: the sum of the gradients of three sums times their factors.
+
+    The three sums are the sums of w |p - t|, w p and 1 - SSIM.
+    """
     for k in range(len(grad)):
         p = pred[k]
         t = target[k]
@@ -300,7 +305,7 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
         window: Weights of SSIM's window, see `loss_forward`. (taps,)
         radius: Radius of the window in pixels.
         weight: Weight of a foreground pixel, relative to a background pixel, float32.
-        factors: Gradient of the first three sums, float32. (n, 3)
+        factors: Gradient of the loss with respect to the first three sums, float32. (n, 3)
         grads: Output for the gradient of the predicted masks, float32. (n, H, W)
         first: First mask.
         last: One past the last mask.

@@ -7,12 +7,12 @@ from torch.nn import functional as F
 # The usual constants of SSIM for values in [0, 1].
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
-# Threshold of the weighted mean of a mask in a window, above which the window covers part of the
-# mask. D-SSIM is the mean of 1 - SSIM over the windows that cover part of the prediction or of the
-# target. For a prediction that misses its element, it should be near 1: with this threshold it is
-# 0.94 to 1.03 for elements of 4 to 60 m and rasters of 128 x 64 to 256 x 128. With a threshold of 0
-# it would be 0.59 to 0.93, because the mean would include windows that cover almost nothing of the
-# masks. With 1e-2 it would be 1.09 to 1.38.
+# A window covers part of a mask if the weighted mean of the mask in the window is above this
+# threshold. D-SSIM is the mean of 1 - SSIM over the windows that cover part of the prediction or of
+# the target. D-SSIM should be near 1 for a prediction that misses its element. With this threshold,
+# it is 0.94 to 1.03 for elements of 4 to 60 m and rasters of 128 x 64 to 256 x 128. With a
+# threshold of 0, it would be 0.59 to 0.93, because the mean would include windows that cover almost
+# nothing of the masks. With a threshold of 1e-2, it would be 1.09 to 1.38.
 MIN_COVERAGE = 1e-3
 
 

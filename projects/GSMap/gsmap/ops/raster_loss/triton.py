@@ -1,15 +1,18 @@
 # Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
-"""Triton kernels: the raster loss by separable blurs, in float32.
+"""Triton kernels of the raster loss, with separable blurs, in float32.
 
-A program computes ``BLOCK`` consecutive pixels of one instance. In the forward pass, one kernel
-blurs p, t, p^2 + t^2 and p t along rows. The next one blurs them along columns, computes SSIM, and
-writes the sums of its block to separate entries of a buffer (n, blocks, 7). There are no atomics,
-so repeated runs are equal to the bit. The backward pass computes the blurs again and, from them,
-the derivatives of SSIM with respect to the blurred p, p^2 and p t. The gradient with respect to a
-map before its blur is the transposed blur of the derivative. As the window is symmetric, the
-transposed blur equals the blur: the derivatives are blurred once more. Neighbours are read from the
-cache, once for each tap of the window.
+In this file, p is the predicted mask and t is the ground-truth mask. A program computes ``BLOCK``
+consecutive pixels of one instance. In the forward pass, the first kernel blurs p, t, p^2 + t^2 and
+p t along rows. The second kernel blurs them along columns, computes SSIM, and writes the sums of
+its block to separate entries of a buffer (n, blocks, 7). There are no atomics, so repeated runs
+give bitwise equal results.
+
+The backward pass computes the blurs again and, from them, the derivatives of SSIM with respect to
+the blurred p, p^2 and p t. The gradient with respect to a map before its blur is the transposed
+blur of the derivative. As the window is symmetric, the transposed blur equals the blur, so the
+derivatives are blurred once more. Neighbours are read from the cache, once for each tap (weight) of
+the window.
 """
 
 import torch
@@ -20,9 +23,9 @@ from gsmap.ops.raster_loss.reference import MIN_COVERAGE, SSIM_C1, SSIM_C2
 
 BLOCK = 256
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
-# Where both masks are empty, numerator and denominator of SSIM are the same product, and their
+# Where both masks are empty, numerator and denominator of SSIM are equal products, and their
 # difference must be exactly 0. A fused multiply-add would subtract an unrounded product from a
-# rounded one, which leaves the rounding error.
+# rounded product, so that the rounding error would remain.
 EXACT_OPTIONS = {**OPTIONS, "enable_fp_fusion": False}
 C1 = tl.constexpr(SSIM_C1)
 C2 = tl.constexpr(SSIM_C2)
@@ -31,7 +34,7 @@ COVERAGE = tl.constexpr(MIN_COVERAGE)
 
 @triton.jit
 def _block(height, width, BLOCK: tl.constexpr):
-    """Instance of a program, number of pixels of an instance, and pixels of the block."""
+    """Return a program's instance, the number of pixels per instance, and the block's pixels."""
     n = tl.program_id(1).to(tl.int64)
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     return n, height * width, index
@@ -89,7 +92,10 @@ def _blur_columns(maps, window, index, pixels, width, TAPS: tl.constexpr, BLOCK:
 
 @triton.jit
 def _ssim_terms(maps, window, n, index, pixels, width, TAPS: tl.constexpr, BLOCK: tl.constexpr):
-    """Blurred p and t, both numerators and both denominators of SSIM. (BLOCK,) each"""
+    """Compute the blurred p and t, and the two factors of SSIM's numerator and denominator.
+
+    (BLOCK,) each
+    """
     map_p = maps + n * 4 * pixels
     map_t = map_p + pixels
     map_squares = map_p + 2 * pixels
@@ -150,17 +156,17 @@ def sums_kernel(
     p = tl.load(preds + n * pixels + index, mask=ok, other=0.0)
     t = tl.load(targets + n * pixels + index, mask=ok, other=0.0)
     excess = (weight - 1) * t
-    # With w = 1 + excess, the sums are in the order of the reference: w |p - t|, w p, 1 - SSIM,
-    # w t, w - 1, number of windows with part of the target, number of windows with part of either
-    # mask.
+    # The weight of a pixel is w = 1 + excess. The sums are in the order of the reference:
+    # w |p - t|, w p, 1 - SSIM, w t, w - 1, the number of windows with part of the target, and the
+    # number of windows with part of either mask.
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * 7
     tl.store(out, tl.sum((1 + excess) * tl.abs(p - t)))
     tl.store(out + 1, tl.sum((1 + excess) * p))
     tl.store(out + 2, tl.sum(tl.where(ok, dissimilarity, 0.0)))
     tl.store(out + 3, tl.sum((1 + excess) * t))
     tl.store(out + 4, tl.sum(excess))
-    # The two numbers have different thresholds, as in the reference: any part of the target counts,
-    # but the coverage by either mask must exceed `MIN_COVERAGE`.
+    # As in the reference, the two numbers have different thresholds. For the first, any part of the
+    # target counts. For the second, the coverage by either mask must exceed `MIN_COVERAGE`.
     tl.store(out + 5, tl.sum((ok & (mean_t > 0)).to(tl.float32)))
     either = (mean_p > COVERAGE) | (mean_t > COVERAGE)
     tl.store(out + 6, tl.sum((ok & either).to(tl.float32)))
@@ -183,10 +189,10 @@ def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK
     p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
         maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
-    # SSIM = A B / (C D) with the four terms A, B, C and D in this order. The blurred p is in all
-    # of them, with the derivatives 2 t, -2 t, 2 p and -2 p. The blurred p^2 is only in D, with the
-    # derivative 1, and the blurred p t only in B, with the derivative 2. So the derivative of SSIM
-    # with respect to the blurred p is 2 (t (B - A) + p SSIM (C - D)) / (C D).
+    # SSIM = A B / (C D), where A, B, C and D are the last four terms in this order. With respect to
+    # the blurred p, their derivatives are 2 t, -2 t, 2 p and -2 p. The blurred p^2 occurs only in
+    # D, with the derivative 1, and the blurred p t only in B, with the derivative 2. So the
+    # derivative of SSIM with respect to the blurred p is 2 (t (B - A) + p SSIM (C - D)) / (C D).
     scale = 1 / (low_mean * low_var)
     ssim = top_mean * top_cov * scale
     change = t * (top_cov - top_mean) + p * ssim * (low_mean - low_var)
@@ -292,7 +298,7 @@ def _blur_products(preds, targets, window):
 
 
 def _num_blocks(masks):
-    """Number of blocks of a mask."""
+    """Number of blocks of pixels of one mask."""
     return triton.cdiv(masks.shape[1] * masks.shape[2], BLOCK)
 
 
@@ -357,7 +363,7 @@ def raster_loss_sums_backward(grads, preds, targets, window, weight):
     with torch.cuda.device_of(preds):
         maps = _blur_products(preds, targets, window=window)
         slopes_kernel[blocks, instances](window, maps, slopes=slopes, **sizes, **OPTIONS)
-        # The maps are not needed any more: their memory becomes the output of the next kernel.
+        # The maps are not needed any more, so the next kernel writes its output to their memory.
         blurred = maps.view(-1)[: slopes.numel()]
         slope_rows_kernel[blocks, 3 * instances](
             window, slopes, blurred=blurred, **sizes, **OPTIONS

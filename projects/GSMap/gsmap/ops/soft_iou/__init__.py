@@ -18,14 +18,15 @@ _pairwise_minima = fused_operator(
 def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> Tensor:
     r"""Compute the soft IoU of each prediction with each ground truth.
 
-    The IoU is :math:`\sum_p \min(a, b) / \sum_p \max(a, b)`, and 0 for two empty masks. Only sums
-    of minima are computed per pair, without an (N, K, H, W) tensor.
+    The IoU of the masks a and b is :math:`\sum_p \min(a, b) / \sum_p \max(a, b)`, summed over the
+    pixels p, and 0 for two empty masks. Only sums of minima are computed per pair, without an
+    (N, K, H, W) tensor.
 
     Args:
         preds: Predicted masks in [0, 1]. (N, H, W)
         targets: Ground-truth masks in [0, 1]. (K, H, W)
-        backend: Backend, see `choose_backend`. The fused kernels have no gradient; ``"auto"`` takes
-            them where no gradient is needed.
+        backend: Backend, see `choose_backend`. The fused kernels have no gradient, so ``"auto"``
+            selects them only if no gradient is needed.
 
     Returns:
         Soft IoU in [0, 1]. (N, K)

@@ -1,10 +1,10 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Fused CPU kernel (numba): sum of minima of each pair of masks.
+"""Fused CPU kernel (numba): sum of the pixelwise minima of each pair of masks.
 
-A ground-truth mask, and so the minimum, is zero almost everywhere. The nonzero pixels of each
-target are listed once, and each prediction is read only at these pixels. A sum runs in a fixed
-order in one thread.
+A ground-truth mask, and therefore the minimum, is zero almost everywhere. The nonzero pixels of
+each target are listed once, and each prediction is read only at these pixels. One thread computes a
+sum in a fixed order, so results are repeatable.
 """
 
 import numpy as np
@@ -38,7 +38,7 @@ def list_pixels(targets):
 
 @njit(nogil=True, cache=True)
 def sum_minima(preds, starts, indices, values, out, first, last):
-    """Sum the minima of the predictions ``first`` to ``last - 1`` and each target.
+    """Sum the pixelwise minima of each target and the predictions ``first`` to ``last - 1``.
 
     Args:
         preds: Flat predicted masks, float32. (N, pixels)
@@ -59,7 +59,10 @@ def sum_minima(preds, starts, indices, values, out, first, last):
 
 
 def pairwise_minima(preds, targets):
-    """Sum the minima of each pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
+    """Sum the pixelwise minima of each pair of flat float32 masks.
+
+    Shapes: (N, pixels), (K, pixels) -> (N, K)
+    """
     minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
     starts, indices, values = list_pixels(targets.contiguous().numpy())
     # `run_in_threads` divides the predictions among threads, and gives the kernel their range

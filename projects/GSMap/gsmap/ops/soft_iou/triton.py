@@ -1,9 +1,9 @@
 # Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
-"""Triton kernel: sum of minima of each pair of masks.
+"""Triton kernel that sums the pixelwise minimum of each pair of masks.
 
 A program computes one pair. It loops over blocks of pixels with one partial sum per lane, and adds
-these at the end. There are no atomics, so repeated runs are equal to the bit.
+the partial sums at the end. There are no atomics, so repeated runs are equal to the bit.
 """
 
 import torch
@@ -15,7 +15,7 @@ BLOCK = 1024
 
 @triton.jit
 def minima_kernel(preds, targets, minima, pixels, BLOCK: tl.constexpr):
-    """Sum the minima of one pair of masks.
+    """Sum the pixelwise minimum of one pair of masks.
 
     Args:
         preds: Flat predicted masks, float32. (N, pixels)
@@ -36,7 +36,10 @@ def minima_kernel(preds, targets, minima, pixels, BLOCK: tl.constexpr):
 
 
 def pairwise_minima(preds, targets):
-    """Sum the minima of each pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
+    """Sum the pixelwise minimum of each pair of masks. (N, pixels), (K, pixels) -> (N, K)
+
+    Masks are flat float32 tensors.
+    """
     minima = preds.new_empty(len(preds), len(targets))
     if minima.numel():
         with torch.cuda.device_of(preds):

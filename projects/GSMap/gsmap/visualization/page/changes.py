@@ -1,4 +1,4 @@
-"""Map changes on the report page: their lines in each frame, and a table of all changes.
+"""Map changes on the report page: lines in the frames, and a table of all changes.
 
 A change is a map element, or a part of one, that was added, removed or moved since an old map was
 made.
@@ -25,7 +25,7 @@ from gsmap.visualization.page.tables import Table
 
 
 class ChangeLayer:
-    """Changes of the maps in which the samples of an annotation file lie.
+    """Changes of the maps to which the samples of an annotation file belong.
 
     Args:
         path: File of ``build_map.py --changes`` or of MiniCity; None for no changes.
@@ -33,7 +33,7 @@ class ChangeLayer:
 
     Raises:
         FileNotFoundError: If the file of changes does not exist.
-        ValueError: If it is malformed.
+        ValueError: If the file of changes is malformed.
     """
 
     def __init__(self, path: Path | None, file: AnnotationFile) -> None:
@@ -64,7 +64,8 @@ class ChangeLayer:
             line = MapElements.from_polylines([change.points], [0]).to_frame(frame_from_global)
             pieces = clip_to_box(line.points, self._meta.x_range, self._meta.y_range)
             if pieces and is_closed(line.points):
-                pieces = [line.points]  # the outline of an area is drawn whole, not cut to lines
+                # The outline of an area is drawn as a whole, because cutting would open it.
+                pieces = [line.points]
             for piece in pieces:
                 self._shown.add(index)
                 entry = {
@@ -76,7 +77,10 @@ class ChangeLayer:
         return entries
 
     def notes(self) -> list[str]:
-        """One sentence with the number of changes, and how many of them `entries` has returned."""
+        """Return a sentence with the number of changes, in total and returned by `entries`.
+
+        The list is empty without a file of changes.
+        """
         if not self._is_shown:
             return []
         counts = Counter(change.kind for change in self._changes)
@@ -85,7 +89,7 @@ class ChangeLayer:
         return [f"{total} of the map: {', '.join(parts)}; {len(self._shown)} in these frames."]
 
     def tables(self) -> list[Table]:
-        """Table of all changes, the surest first; none without a file."""
+        """Return a table of all changes, by falling confidence; empty without a file of changes."""
         if not self._is_shown:
             return []
         rows = []
@@ -96,7 +100,7 @@ class ChangeLayer:
 
 
 def _distance(change: MapChange) -> str:
-    """Distance of a moved element with its standard error; empty for others."""
+    """Format the distance of a moved element with its standard error; empty for other changes."""
     if change.moved_m is None:
         return ""
     if change.moved_std_m is None:
@@ -105,7 +109,7 @@ def _distance(change: MapChange) -> str:
 
 
 def _drives(change: MapChange) -> str:
-    """Number of drives that confirm the change, of all drives past it; empty if unknown."""
+    """Format how many of the drives past a change confirm it; empty if unknown."""
     if change.passes is None:
         return ""
     agreeing, in_view = change.passes
@@ -123,7 +127,7 @@ def _describe(change: MapChange) -> str:
 
 
 def _row(change: MapChange) -> Sequence[str]:
-    """Row of the table."""
+    """Return the row of a change in the table."""
     x, y = np.mean(change.points, axis=0)
     return [
         change.class_name,

@@ -27,8 +27,9 @@ def choose_frames(
 ) -> list[int]:
     """Choose samples for the page.
 
-    Without results, they are evenly spread. With one result, three quarters are evenly spread and
-    the others have the lowest F1. With two results, the others have the largest difference in F1.
+    Without results, the samples are evenly spread. With results, three quarters of them are evenly
+    spread. The others have the lowest F1 of one result, or the largest difference between the F1 of
+    two results.
 
     Args:
         tokens: Tokens of all samples, in order.
@@ -50,7 +51,7 @@ def choose_frames(
         f1 = []
         for result in results:
             f1.append(np.array([result.f1(token, score_thr) for token in tokens]))
-        # The samples with the lowest values are chosen.
+        # The samples with the lowest ranking values are chosen.
         ranking = f1[0] if len(f1) == 1 else -abs(f1[0] - f1[1])
         num_chosen = len(chosen) + max_frames - num_even
         for index in np.argsort(ranking, kind="stable").tolist():
@@ -61,7 +62,7 @@ def choose_frames(
 
 
 def to_centimetres(points: np.ndarray, view: FrameView) -> list[int]:
-    """Convert points of a frame (n, 2) to (right, ahead) in whole centimetres. -> (2 n,)"""
+    """Convert points (n, 2) from metres to (right, ahead) in whole centimetres, flat. (2 n,)"""
     centimetres = np.rint(100 * view.display_from_frame(points)).astype(int)
     return centimetres.ravel().tolist()
 
@@ -84,7 +85,7 @@ def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
 
 
 def predictions_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
-    """Convert the predictions of a sample to plain values, by falling score.
+    """Convert the predictions of a sample to plain values, in descending order of scores.
 
     Predictions with scores too small for AP_raster are dropped.
 

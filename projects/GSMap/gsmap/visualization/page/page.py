@@ -46,22 +46,22 @@ _GENERATOR = b'<meta name="generator" content="gsmap">'
 
 @dataclass(frozen=True)
 class PageOptions:
-    """Content of the report page.
+    """Options of the report page.
 
     Args:
         data_root: Folder that image paths are relative to; by default the folder of the annotation
             file.
         max_frames: Largest number of frames.
         score_thr: Initial value of the slider of the score, in [0, 1].
-        image_width: Largest width of the images in pixels, doubled for the camera that looks
-            ahead, which is drawn large; 0 leaves images out.
+        image_width: Largest width of the images in pixels. The image of the front camera is drawn
+            large, with up to twice this width. 0 leaves images out.
         allow_mismatch: Whether samples without results count as samples without predictions, and
             results without ground truth are ignored; otherwise both are errors.
         by: Groups of samples with separate AP: ``scene``, ``map``, ``distance``, or a JSON file
             with the group of each scene or sample.
         allow_other_split: Whether models may be of another split than the annotation file.
         law: Distribution of the errors of vertices, ``normal`` or ``laplace``, for results with
-            Gaussians; by default the distribution of their calibration, or else ``normal``.
+            Gaussians; by default the distribution of their calibration, or ``normal`` without one.
         changes: File of changes of the map (``build_map.py --changes``), shown in the frames and
             in a table.
 
@@ -96,10 +96,10 @@ def page_data(
         annotations: Annotation file.
         results: At most two result files, by their names on the page. If there is none, the page
             has only ground truth and cameras.
-        options: Content of the page.
+        options: Options of the page.
 
     Returns:
-        Plain values, the input of ``page.js``.
+        Dictionary of plain values, the input of ``page.js``.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -141,7 +141,7 @@ def page_data(
     tables: list[Table] = []
     if scored:
         tables = _tables(scored, truth=truth, style=style, file=file, options=options)
-    notes += layer.notes()  # after all frames: it counts the changes in them
+    notes += layer.notes()  # only after the loop over the frames, which counts their changes
     tables += layer.tables()
     return {
         "title": f"{meta.dataset} {meta.split}: {' and '.join(results) or 'ground truth'}",
@@ -174,7 +174,7 @@ def _score_results(
         results: Result files by their names on the page.
         truth: Ground truth of each sample, by token.
         meta: Metadata of the annotation file.
-        options: Content of the page.
+        options: Options of the page.
     """
     scored = []
     for name, path in results.items():
@@ -194,7 +194,7 @@ def _score_results(
 def _collect_notes(
     scored: Sequence[ScoredResult], num_chosen: int, num_samples: int, max_frames: int
 ) -> list[str]:
-    """Notes of the results, and a note on the choice of frames if the page leaves frames out.
+    """Collect the notes of the results, and a note on the choice of frames if some are left out.
 
     Args:
         scored: Results, with their notes.
@@ -283,9 +283,9 @@ def _tables(
     Args:
         scored: One or two results.
         truth: Ground truth of each sample, by token.
-        style: Class names.
+        style: Titles and colours of the classes.
         file: Annotation file.
-        options: Content of the page.
+        options: Options of the page.
     """
     scene_of = dict(zip(file.column("token"), file.column("scene"), strict=True))
     has_scenes = len(set(scene_of.values())) > 1
@@ -308,11 +308,11 @@ def _tables(
 
 
 def page_html(data: Mapping[str, Any]) -> str:
-    """Create the page: one HTML file that loads no other file and runs no script but its own.
+    """Create the page: one HTML file that loads no other file and runs only the script in it.
 
     Args:
-        data: Data from ``page_data``. Its texts are untrusted. They are in a block of JSON without
-            ``<``, and the script displays them as text.
+        data: Data from ``page_data``. Its texts are untrusted. The page contains them in a block of
+            JSON without ``<``, and the script displays them as text, not as HTML.
 
     Returns:
         HTML.
@@ -321,7 +321,7 @@ def page_html(data: Mapping[str, Any]) -> str:
     template = Template(folder.joinpath("page.html").read_text("utf-8"))
     style = folder.joinpath("page.css").read_text("utf-8")
     script = folder.joinpath("page.js").read_text("utf-8")
-    # Images are in blocks of their frames, which are parsed when a frame is opened.
+    # The images of each frame are in a separate block, which is parsed when the frame is opened.
     frames = []
     image_blocks = []
     for frame in data["frames"]:

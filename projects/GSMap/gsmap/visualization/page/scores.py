@@ -89,10 +89,11 @@ def score_result(
         path: Results in MapTR's JSON form, with or without Gaussians.
         truth: Ground truth of each sample, by token.
         meta: Metadata of the annotation file.
-        allow_mismatch: Whether samples may differ from the ground truth. A sample without results
-            then counts as without predictions, and results without ground truth are ignored.
-        allow_other_split: Whether the model may have been trained on another list of scenes than
-            the list of the ground truth, or the results be for such other data.
+        allow_mismatch: Whether the samples of the results and of the ground truth may differ. A
+            sample without results then counts as a sample without predictions, and results without
+            ground truth are ignored.
+        allow_other_split: Whether to accept results of a model that was trained on another list of
+            scenes than the list of the ground truth, and results for such other data.
         law: Distribution of the errors, ``normal`` or ``laplace``; by default the distribution of
             the model's calibration in the file, or ``normal`` without a calibration.
 
@@ -124,12 +125,12 @@ def score_result(
     for class_name, count in sorted(num_ignored.items()):
         notes.append(f"{count} predictions of class {class_name!r} are not scored")
     evaluator = _create_evaluator(meta)
-    nothing = MapElements.from_polylines()
+    no_elements = MapElements.from_polylines()
     sample_values = []
     matches = {}
     for token, true_elements in truth.items():
         values = evaluator.match(
-            token, predictions=predictions.get(token, nothing), ground_truth=true_elements
+            token, predictions=predictions.get(token, no_elements), ground_truth=true_elements
         )
         chamfer = cast(FrameMatches, values["chamfer"])
         sample_values.append(values)
@@ -158,10 +159,10 @@ def score_by_distance(
         The result with new reports, in which each band of a sample counts as a separate sample.
     """
     evaluator = _create_evaluator(meta)
-    nothing = MapElements.from_polylines()
+    no_elements = MapElements.from_polylines()
     samples = []
     for token, true_elements in truth.items():
-        predictions = result.predictions.get(token, nothing)
+        predictions = result.predictions.get(token, no_elements)
         sample = Sample(token, predictions=predictions, ground_truth=true_elements)
         samples.append(sample)
     area_labels = [label for label, name in enumerate(meta.classes) if name in AREA_CLASSES]

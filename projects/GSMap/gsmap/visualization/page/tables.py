@@ -121,7 +121,7 @@ def difference_table(
         second = second_result.f1(token, score_thr)
         if first != second:
             f1_of_samples.append((token, first, second))
-    f1_of_samples.sort(key=lambda row: -abs(row[2] - row[1]))
+    f1_of_samples.sort(key=lambda row: -abs(row[2] - row[1]))  # largest difference first
     rows = []
     for token, first, second in f1_of_samples[:_MAX_DIFFERENCES]:
         difference = f"{second - first:+.2f}"
@@ -236,7 +236,8 @@ def reliability_curves(
         style: Class names.
 
     Returns:
-        Panels of the classes with a curve. Each has lines for errors along and across.
+        Panels of the classes with a curve. Each panel has lines for the errors along and across the
+        elements.
     """
     vertices_of_results = [
         _matched_vertices(result, truth=truth, style=style) for result in results
@@ -258,7 +259,8 @@ def reliability_curves(
             title = f"{axis_name}, in the interval of 68.3 % ({' | '.join(laws)} law)"
             # The page shows the entry "ap" behind the label, as it does for the other curves.
             lines.append({"label": title, "ap": shares, "points": points})
-        if any(any(line["points"]) for line in lines):
+        has_curve = any(any(line["points"]) for line in lines)
+        if has_curve:
             panels.append({"metric": "Gaussians", "class": label, "lines": lines})
     return panels
 
@@ -333,7 +335,7 @@ def group_tables(results: Sequence[ScoredResult], groups: Groups, by: str) -> li
 
 
 def _curve_points(detections: ClassDetections, column: int) -> list[list[float]]:
-    """Recall and precision at evenly spread ranks, for the threshold of a column of the hits."""
+    """Points (recall, precision) at evenly spread ranks, for one column (threshold) of the hits."""
     recall, precision = precision_recall(detections.hits[:, column], detections.num_gts)
     points = np.stack([recall, precision], axis=1).round(3)
     if len(points) > _MAX_CURVE_POINTS:
