@@ -116,8 +116,10 @@ def turns(line: FloatArray) -> tuple[float, float]:
         line: Vertices in metres. (P, 2) or (P, 3)
 
     Returns:
-        The mean in [0, 180] and the share in [0, 1].
+        The mean in [0, 180] and the share in [0, 1]. Both are 0 for a line of two vertices.
     """
+    if len(line) < 3:
+        return 0.0, 0.0
     edges = np.diff(line[:, :2], axis=0)
     headings = np.degrees(np.arctan2(edges[:, 1], edges[:, 0]))
     differences = (np.diff(headings) + 180.0) % 360.0 - 180.0  # in [-180, 180)

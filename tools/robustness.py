@@ -57,6 +57,7 @@ def parse_args() -> argparse.Namespace:
     )
     add_config_options(parser)
     args = parser.parse_args()
+    args.kinds = list(dict.fromkeys(args.kinds))  # a kind that is given twice is measured once
     if args.samples is not None and args.samples < 1:
         parser.error(f"--samples must be >= 1, got {args.samples}")
     return args

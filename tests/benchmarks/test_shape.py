@@ -20,6 +20,7 @@ FOLDED = STRAIGHT[[0, 2, 1, 3, 4]]
 def test_turns_of_a_straight_and_of_a_folded_line():
     """Points at 0, 4, 2, 6, 8 m: two of three vertices lead back."""
     assert shape.turns(STRAIGHT) == (0.0, 0.0)
+    assert shape.turns(STRAIGHT[:2]) == (0.0, 0.0)
     assert shape.turns(FOLDED) == pytest.approx((120.0, 2 / 3))
     assert shape.length_m(FOLDED) == pytest.approx(4 + 2 + 4 + 2)
 

@@ -1,6 +1,7 @@
 """Tracks, C-mAP and jitter: worked by hand, and equal to MapTracker's tools."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -254,5 +255,6 @@ def test_the_command_scores_drives_and_writes_tracks(files, tmp_path, capsys):
 def test_rules_out_of_range_are_refused():
     with pytest.raises(ValueError, match="look_back must be >= 1, got 0"):
         replace(CONFIG, look_back=0)
-    with pytest.raises(ValueError, match="thresholds must be > 0 m"):
-        replace(CONFIG, thresholds=(0.0,))
+    for thresholds in ((0.0,), (0.5, math.nan, 1.0), (math.nan,), (math.inf,), ()):
+        with pytest.raises(ValueError, match="thresholds must be > 0 m"):
+            replace(CONFIG, thresholds=thresholds)

@@ -1,3 +1,5 @@
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -242,8 +244,9 @@ def test_bad_configuration_is_refused():
             RasterConfig(classes)
     with pytest.raises(ValueError, match="odd"):
         RasterConfig(CLASSES, dilation_px=4)
-    with pytest.raises(ValueError, match="at least one pixel"):
-        RasterConfig(CLASSES, px_per_m=0.01)
+    for px_per_m in (0.01, 0.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="at least one pixel"):
+            RasterConfig(CLASSES, px_per_m=px_per_m)
     with pytest.raises(
         ValueError, match=r"at most 2e\+07 pixels, not 800000 x 800000: give --range"
     ):

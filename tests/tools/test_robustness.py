@@ -48,7 +48,7 @@ def test_a_run_writes_table_figures_and_plot(tool, minicity_root, tmp_path, monk
     options = {"dataset": "minicity", "out_dir": tmp_path}
     convert_nuscenes(NuScenesOptions(minicity_root, "v1.0-trainval", **options))
     words = ["gsmap_r18_minicity", "--data-root", str(minicity_root), "--samples", "1"]
-    options = ["--kinds", "camera_lost", "camera_delayed", "--out", str(tmp_path)]
+    options = ["--kinds", "camera_lost", "camera_delayed", "camera_lost", "--out", str(tmp_path)]
     options += ["--cfg-options", f"test_dataloader.dataset.ann_file={tmp_path}/{FILE}"]
     monkeypatch.setattr("sys.argv", ["robustness.py", *words, *options])
     monkeypatch.setattr(tool, "SEVERITIES", (1, 5))

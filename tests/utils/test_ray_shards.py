@@ -4,10 +4,11 @@ import argparse
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from gsmap.utils.ray_shards import run_on_ray
+from gsmap.utils.ray_shards import _Run, run_on_ray
 from gsmap.utils.shards import WHOLE, Shard, find_shards
 
 COMMAND = """
@@ -78,6 +79,23 @@ def test_a_shard_that_fails_is_named_and_the_others_are_made(cluster, tmp_path, 
         make(tmp_path, monkeypatch, bad=4)
     with pytest.raises(FileNotFoundError, match="lacks 1 of its 5 shards: 4"):
         find_shards(tmp_path / "all.txt")
+
+
+@pytest.mark.parametrize(
+    ("resources", "has_room"),
+    [
+        ({}, True),
+        ({"num_cpus": 2, "num_gpus": 1, "memory": 1000}, True),
+        ({"num_cpus": 3}, False),
+        ({"num_gpus": 2}, False),
+        ({"memory": 1001}, False),
+    ],
+)
+def test_a_second_copy_of_a_shard_needs_all_of_its_resources(resources, has_room):
+    free = {"CPU": 2.0, "GPU": 1.0, "memory": 1000.0}
+    ray = SimpleNamespace(available_resources=lambda: free)
+    run = _Run(ray=ray, words=[], count=1, resources=resources, patience_s=1.0)
+    assert run._has_room() == has_room
 
 
 def test_without_ray_the_extra_is_named(monkeypatch):

@@ -99,6 +99,7 @@ def test_nothing_matched_gives_zero_with_a_gradient():
     ("change", "match"),
     [
         ({"line_softness": 0}, "softness must be > 0, got 0 and 4.0"),
+        ({"line_softness": math.nan}, "softness must be > 0, got nan and 4.0"),
         ({"size": (0, 4)}, r"size must be rows and columns, both >= 1, got \(0, 4\)"),
         ({"polygon_classes": (-1,)}, r"polygon_classes must be >= 0, got \(-1,\)"),
         ({"distance": "cubed"}, "distance must be one of .* got 'cubed'"),

@@ -211,6 +211,9 @@ class _Run:
     def _has_room(self) -> bool:
         """Whether the resources for one more shard are free. Then no shard waits for resources."""
         free = self.ray.available_resources()
-        cpus = self.resources.get("num_cpus", 1)
-        gpus = self.resources.get("num_gpus", 0)
-        return free.get("CPU", 0) >= cpus and free.get("GPU", 0) >= gpus
+        needed = {
+            "CPU": self.resources.get("num_cpus", 1),
+            "GPU": self.resources.get("num_gpus", 0),
+            "memory": self.resources.get("memory", 0),
+        }
+        return all(free.get(name, 0) >= amount for name, amount in needed.items())

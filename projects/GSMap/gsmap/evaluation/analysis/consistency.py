@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from gsmap.evaluation.core import chamfer_kernels as kernels
 from gsmap.evaluation.core.average_precision import area_ap
-from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, checked_thresholds
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import resample_all
@@ -62,11 +62,9 @@ class ConsistencyConfig:
     min_truth_iou: float = 1e-2
 
     def __post_init__(self) -> None:
-        if not self.classes or not self.thresholds or min(self.thresholds) <= 0:
-            raise InputError(
-                "classes and thresholds must not be empty and thresholds must be > 0 m, got "
-                f"{self.classes} and {self.thresholds}."
-            )
+        if not self.classes:
+            raise InputError("classes must not be empty.")
+        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
         if self.look_back < 1:
             raise InputError(f"look_back must be >= 1, got {self.look_back}.")
 

@@ -54,7 +54,7 @@ def checked_thresholds(thresholds: Sequence[float]) -> tuple[float, ...]:
         rounded = sorted(round(float(value), ndigits=6) for value in thresholds)
     except (TypeError, ValueError):
         rounded = []
-    if not (rounded and 0 < rounded[0] <= rounded[-1] < math.inf):
+    if not (rounded and all(0 < value < math.inf for value in rounded)):  # false for NaN, too
         raise InputError(f"thresholds must be > 0 m, at least one, got {thresholds!r:.80}.")
     return tuple(rounded)
 

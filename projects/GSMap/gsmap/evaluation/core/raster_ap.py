@@ -8,6 +8,7 @@ Rules, equal to MapVR's evaluator:
 - At most 100 predictions of a class count in a sample.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
@@ -71,7 +72,7 @@ class RasterConfig(Metric):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "classes", checked_classes(self.classes))
-        if self.px_per_m <= 0 or min(self.size_px) < 1:
+        if not 0 < self.px_per_m < math.inf or min(self.size_px) < 1:  # `not` is true for NaN, too
             raise InputError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
         if np.prod(self.size_px, dtype=np.float64) > _MOST_PX:
             columns, rows = self.size_px

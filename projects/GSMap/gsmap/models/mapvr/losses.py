@@ -46,7 +46,7 @@ class ElementRenderer:
             raise InputError(f"polygon_classes must be >= 0, got {self.polygon_classes}.")
         if self.distance not in DISTANCES:
             raise InputError(f"distance must be one of {DISTANCES}, got {self.distance!r}.")
-        if self.line_softness <= 0 or self.polygon_softness <= 0:
+        if not (self.line_softness > 0 and self.polygon_softness > 0):  # true for NaN, too
             raise InputError(
                 f"softness must be > 0, got {self.line_softness} and {self.polygon_softness}."
             )
