@@ -4,6 +4,7 @@ The numbers are in ``gsmap/models/<method>/paper.json``. A setting that no numbe
 there.
 """
 
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -67,3 +68,15 @@ def test_a_paper_has_its_page_and_its_row_in_the_comparison(method):
     (row,) = rows
     assert all(f"{number:,}" in row for number in paper["parameters"].values())
     assert f"arxiv.org/abs/{paper['arxiv']}" in row
+
+
+def test_the_comparison_has_the_rows_of_all_papers():
+    spec = spec_from_file_location("method_tables", REPO / "docs/method_tables.py")
+    tables = module_from_spec(spec)
+    spec.loader.exec_module(tables)
+    text = tables.PAGE.read_text(encoding="utf-8")
+    assert tables.with_tables(text) == text, "run: python docs/method_tables.py"
+    for method in METHODS:
+        assert f"| {method.title}, [{method.paper()['arxiv']}](" in text
+    with pytest.raises(ValueError, match="needs one pair of the markers <!-- overview"):
+        tables.with_tables("# A page without tables")

@@ -39,6 +39,8 @@ class Method:
             Dictionary with these entries:
 
             - ``arxiv``: Number of the paper at arXiv.
+            - ``overview``: Row of the method in ``docs/methods.md``, which
+              ``python docs/method_tables.py`` writes.
             - ``parameters``: Number of trainable parameters of each config.
             - ``settings``: Published values by config and path of the setting.
             - ``heads``: Published parts of each config's head: the number of queries of each
