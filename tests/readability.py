@@ -7,6 +7,7 @@ import argparse
 import ast
 import re
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from gsmap.utils.words import markdown_table
@@ -143,14 +144,23 @@ def is_participle(name: str) -> bool:
     return re.fullmatch(r"[a-z]+ed", name) is not None and name not in NOUNS_IN_ED
 
 
+@cache
+def count_file(path: Path) -> Counts:
+    """Count a module, once per process."""
+    counts = Counts()
+    Reader(path.read_text(encoding="utf-8"), counts)
+    return counts
+
+
 def count(*paths: Path) -> Counts:
     """Count files, and all modules of folders."""
-    counts = Counts()
+    total = Counts()
     for path in paths:
         files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
         for file in files:
-            Reader(file.read_text(encoding="utf-8"), counts)
-    return counts
+            for name, number in vars(count_file(file)).items():
+                setattr(total, name, getattr(total, name) + number)
+    return total
 
 
 def percentage(part: int, whole: int) -> int:
