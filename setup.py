@@ -25,6 +25,7 @@ PATTERNS = (
 
 def shipped_files() -> list[str]:
     """Return the paths of configs, commands and trained models, relative to the repository."""
+    # Weights of models without an address are in the repository. All others are downloaded later.
     models = json.loads(Path("models/registry.json").read_text(encoding="utf-8"))
     weights = [f"models/{model['name']}.pth" for model in models if model["address"] is None]
     files = []
@@ -39,7 +40,8 @@ class BuildPackage(build_py):
     def run(self) -> None:
         """Build the package without files of an earlier build.
 
-        An editable installation needs no copies.
+        Setuptools would keep an earlier build, and files that were deleted since would get into the
+        wheel. An editable installation needs no copies.
         """
         package = Path(self.build_lib, "gsmap")
         if package.is_dir() and not self.editable_mode:

@@ -8,6 +8,9 @@ from pathlib import Path
 from benchmarks import data
 from benchmarks.memory import measure_memory
 
+# Each function from `loading` to `memory` belongs to one subcommand. It takes the parsed options of
+# the subcommand and returns figures by name, which `run` prints.
+
 
 def loading(args: argparse.Namespace) -> dict[str, float]:
     """Measure the loading of a tiled annotation file."""
@@ -24,13 +27,15 @@ def ground_truth(args: argparse.Namespace) -> dict[str, float]:
 
 def pipeline(args: argparse.Namespace) -> dict[str, float]:
     """Measure the training pipeline."""
+    # Imported here, since the other subcommands do not need these slow imports.
     from mmengine.config import Config
     from mmengine.registry import init_default_scope
 
-    import gsmap.registered  # noqa: F401
+    import gsmap.registered  # noqa: F401 - adds the classes that the config names to the registries
 
-    init_default_scope("mmdet3d")
+    init_default_scope("mmdet3d")  # type names of the config are looked up in mmdet3d's registries
     config = Config.fromfile(args.config).train_dataloader.dataset
+    # `split=None` accepts an annotation file of any split.
     config.update(data_root=str(args.root), ann_file=str(args.annotations.resolve()), split=None)
     return data.measure_pipeline(config, args.root, count=args.samples)
 
@@ -59,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(required=True)
     command = commands.add_parser("loading", help="open and read a file of many samples")
     command.add_argument("annotations", type=Path)
-    command.add_argument("--samples", type=int, default=28_130)
+    command.add_argument("--samples", type=int, default=28_130)  # nuScenes' training samples
     command.set_defaults(measure=loading)
     command = commands.add_parser(
         "ground-truth", help="ground truth of a frame, with and without maps prepared once"

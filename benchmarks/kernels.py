@@ -30,8 +30,8 @@ from gsmap.structures.grid import BEVGrid
 COLUMNS = (
     "kernel",
     "size",
-    "error",
-    "gradients' errors",
+    "error",  # `relative_error` of the values
+    "gradients' errors",  # `relative_error` of the gradient of each floating-point input
     "plain forward (ms)",
     "forward (ms)",
     "plain backward (ms)",
@@ -50,7 +50,8 @@ class Case:
     Attributes:
         kernel: Name in ``TRITON_KERNELS``.
         size: Description of the size for the table.
-        function: Function to measure. Its arguments are the name of the backend and the inputs.
+        function: Function to measure. Its arguments are the name of the backend (``"triton"`` for
+            the kernel, ``"reference"`` for plain torch) and the inputs.
         inputs: Input tensors. Gradients are computed for the floating-point ones.
         instances: Whether the first dimension of every input is the number of instances. If so,
             errors are measured with the first ``FEW`` instances.
@@ -92,7 +93,7 @@ def run(args: argparse.Namespace) -> None:
     """
     torch.set_num_threads(1)
     device = torch.device(args.device)
-    name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU, interpreted"
+    device_name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU, interpreted"
 
     def publish_line(line: str) -> None:
         print(line, flush=True)
@@ -100,7 +101,7 @@ def run(args: argparse.Namespace) -> None:
             with args.out.open("a") as file:
                 file.write(line + "\n")
 
-    publish_line(f"{name}, torch {torch.__version__}; medians of triton.testing.do_bench\n")
+    publish_line(f"{device_name}, torch {torch.__version__}; medians of triton.testing.do_bench\n")
     publish_line("| " + " | ".join(COLUMNS) + " |")
     publish_line("| " + " | ".join(["---"] * len(COLUMNS)) + " |")
     verdicts: dict[str, bool] = {}
@@ -119,6 +120,7 @@ def run(args: argparse.Namespace) -> None:
         publish_line("| " + " | ".join([case.kernel, case.size, *cells]) + " |")
     correct_kernels = [name for name, correct in verdicts.items() if correct]
     wrong_kernels = sorted(verdicts.keys() - set(correct_kernels))
+    # `SWITCH` is the environment variable that lists the Triton kernels to use.
     publish_line(f"\n{backends.SWITCH}={','.join(correct_kernels)} (correct on this device)")
     if wrong_kernels:
         raise SystemExit(f"error: wrong or failed: {', '.join(wrong_kernels)}.")
@@ -135,7 +137,8 @@ def measure_case(case: Case, device: torch.device, reduced: bool) -> tuple[list[
     Returns:
         Cells of the columns after ``kernel`` and ``size``, and whether the errors are small enough.
     """
-    backends.AUTO_KERNELS = {case.kernel}  # if a function has several kernels, this one is used
+    # `render_gaussians` has two Triton kernels. It uses the one "in warps" if this set contains it.
+    backends.AUTO_KERNELS = {case.kernel}
     inputs = [x.to(device) for x in case.inputs]
     few = [x[:FEW] for x in inputs] if case.instances else inputs
     # The expected results are computed in float64.
@@ -143,7 +146,7 @@ def measure_case(case: Case, device: torch.device, reduced: bool) -> tuple[list[
     actual = results(case, "triton", few)
     expected = results(case, "reference", exact)
     errors = [relative_error(a, b) for a, b in zip(actual, expected, strict=True)]
-    del actual, expected, exact
+    del actual, expected, exact  # frees memory of the device before the timing
     plain_forward, plain_backward = time_case(case, "reference", inputs, reduced=reduced)
     forward, backward = time_case(case, "triton", inputs, reduced=reduced)
     value_error, *gradient_errors = errors
@@ -212,8 +215,10 @@ def results(case: Case, backend: str, inputs: list[Tensor]) -> list[Tensor]:
     out = case.compute(backend, leaves)
     if not case.differentiable:
         return [out]
+    # Each value has another weight, so that errors at two values do not cancel in the gradients.
     weights = torch.linspace(-1, 1, out.numel(), device=out.device).view(out.shape).to(out)
     targets = [x for x in leaves if x.requires_grad]
+    # With `materialize_grads`, an input that has no effect gets a gradient of zeros.
     gradients = torch.autograd.grad(out, targets, grad_outputs=weights, materialize_grads=True)
     return [out.detach(), *gradients]
 
@@ -233,13 +238,14 @@ def median_ms(function: Callable[[], object], device: torch.device, reduced: boo
         reduced: Whether to time a single call.
 
     Returns:
-        Median time in milliseconds. On the CPU, or if ``reduced``, the time of a single call.
+        Median time in milliseconds. On the CPU, or if ``reduced``, the time of a single call after
+        warm-up calls.
     """
-    if device.type == "cuda":
+    if device.type == "cuda" and not reduced:
         from triton.testing import do_bench
 
-        if not reduced:
-            return float(do_bench(function, return_mode="median"))
+        return float(do_bench(function, return_mode="median"))
+    # `measure` returns the shortest time of the repeats, here of one call.
     return measure(function, device, repeats=1).wall_s * 1e3
 
 
@@ -254,11 +260,13 @@ def cases(reduced: bool) -> Iterator[Case]:
 def sampling_cases(reduced: bool) -> Iterator[Case]:
     """Deformable sampling as in decoders, and as in BEV self-attention."""
     height, width = (20, 10) if reduced else (200, 100)
+    # Columns: description, number of queries at full size, batch size.
     sizes = [("1,000 queries", 1000, 1), ("4 x 1,000 queries", 1000, 4)]
     if not reduced:
         sizes.append(("20,000 queries", 20000, 1))
     for size, full_queries, batch in sizes:
         queries = full_queries // 1000 if reduced else full_queries
+        # The kernel also reads bfloat16 values, whose rounding error is at most 2^-8, about 0.004.
         for dtype, largest_error in ((torch.float32, LARGEST_ERROR), (torch.bfloat16, 5e-3)):
 
             def sample(
@@ -266,7 +274,7 @@ def sampling_cases(reduced: bool) -> Iterator[Case]:
                 value: Tensor,
                 locations: Tensor,
                 weights: Tensor,
-                dtype: torch.dtype = dtype,
+                dtype: torch.dtype = dtype,  # the default keeps the value of this iteration
             ) -> Tensor:
                 if backend == "triton":
                     value = value.to(dtype)
@@ -275,6 +283,7 @@ def sampling_cases(reduced: bool) -> Iterator[Case]:
                 )
 
             # Values that ``dtype`` represents exactly: all backends compute with equal inputs.
+            # There are 8 heads of 32 channels, and each query samples 4 locations per head.
             value = torch.randn(batch, height * width, 8, 32).to(dtype).float()
             locations = random_locations((batch, queries, 8, 4), (height, width))
             weights = torch.rand(batch, queries, 8, 4)
@@ -314,7 +323,8 @@ def random_locations(shape: tuple[int, ...], size: tuple[int, int]) -> Tensor:
 def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
     """Sampling of kernels of pixels around image positions, as in the encoders of MapTR and MapQR.
 
-    MapTR (GKT) rounds the positions to pixels, MapQR interpolates between pixels.
+    A kernel of pixels is the set of pixels around one position. MapTR (GKT) rounds the positions to
+    pixels, MapQR interpolates between pixels.
     """
     shape = (15, 25)  # rows and columns of the image features
     rows, columns = (6, 4) if reduced else (200, 100)  # of the BEV features
@@ -324,9 +334,11 @@ def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
     camera_turns = torch.arange(6) / 6  # directions of six cameras, as parts of a full turn
     turns = torch.atan2(y, x).flatten()[None] / (2 * math.pi) - camera_turns[:, None]
     # Distance of each BEV cell from the middle of each image, in image widths of 70 degrees. (V, Q)
+    # Subtracting the rounded number of turns gives the shorter way around, in [-0.5, 0.5] turns.
     from_middle = (turns - turns.round()) * 360 / 70
     visible = from_middle.abs() < 0.5
     depth = (x.square() + y.square()).sqrt().flatten().clamp(min=1.0)
+    # Columns: description, whether positions are interpolated, heads, sampled pixels per position.
     for size, bilinear, heads, samples in (("MapTR", False, 4, 15), ("MapQR", True, 8, 8)):
 
         def sample(
@@ -336,7 +348,7 @@ def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
             weights: Tensor,
             visible: Tensor,
             offsets: Tensor,
-            bilinear: bool = bilinear,
+            bilinear: bool = bilinear,  # the default keeps the value of this iteration
         ) -> Tensor:
             return sample_kernels(
                 value, shape, uv, visible, weights, offsets, bilinear=bilinear, backend=backend
@@ -386,6 +398,7 @@ def raster_cases(reduced: bool) -> Iterator[Case]:
     counts = (2,) if reduced else (6 * 15, 6 * 60)
     for count in counts:
         lines = random_polylines(count, grid)
+        # A Gaussian of 1.0 m x 0.4 m in a random direction at each vertex of the lines.
         means, scales, rotations = gaussians_along(lines, (1.0, 0.4))
         for kernel in ("render_gaussians", "render_gaussians_in_warps"):
             yield Case(

@@ -32,31 +32,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Measure and print the shortest time of one frame.
 
-    Two functions are compared. ``live`` prepares the calibration once, before the measurement, and
-    ``predict_images`` prepares it in each call.
+    Two ways of predicting are compared. `MapInferencer.live` prepares the calibration once, before
+    the measurement, and returns a function of the images alone. `MapInferencer.predict_images`
+    takes the calibration as an argument and prepares it in each call.
 
     Args:
         args: Parsed options of ``add_arguments``.
     """
     torch.set_num_threads(args.threads)
-    cuda_graphs = True if args.cuda_graphs else None  # None: the default of the model
+    # Without the option, the inferencer chooses. False would switch CUDA graphs off.
+    cuda_graphs = True if args.cuda_graphs else None
     inferencer = MapInferencer(
         args.model, device=args.device, amp=args.amp, cuda_graphs=cuda_graphs
     )
-    names = inferencer.cfg.test_dataloader.dataset.cameras
+    camera_names = inferencer.cfg.test_dataloader.dataset.cameras
     height, width = args.size
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, size=(height, width, 3), dtype=np.uint8)
-    images = dict.fromkeys(names, pixels)
-    img_from_cam = np.eye(4)  # intrinsics of `ring_of_cameras`
+    images = dict.fromkeys(camera_names, pixels)  # one image is enough to measure the time
+    # `ring_of_cameras` returns intrinsics times extrinsics. Its intrinsics are repeated here, so
+    # that the extrinsics follow from the product.
+    img_from_cam = np.eye(4)
     img_from_cam[:2, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2]]
-    img_from_frame = ring_of_cameras(len(names), height=height, width=width)  # (V, 4, 4)
+    img_from_frame = ring_of_cameras(len(camera_names), height=height, width=width)  # (V, 4, 4)
     cam_from_frame = np.linalg.inv(img_from_cam) @ img_from_frame  # (V, 4, 4)
-    intrinsics = dict.fromkeys(names, img_from_cam[:3, :3])
-    extrinsics = dict(zip(names, cam_from_frame, strict=True))
-    live = inferencer.live(intrinsics, extrinsics)
+    intrinsics = dict.fromkeys(camera_names, img_from_cam[:3, :3])
+    extrinsics = dict(zip(camera_names, cam_from_frame, strict=True))
+    predict_live = inferencer.live(intrinsics, extrinsics)
     calls = {
-        "live(images)": partial(live, images),
+        "live(images)": partial(predict_live, images),
         "predict_images(images, ...)": partial(
             inferencer.predict_images, images, intrinsics, extrinsics
         ),
@@ -66,8 +70,8 @@ def run(args: argparse.Namespace) -> None:
         cost = measure(call, torch.device(args.device), repeats=args.repeats)
         rows.append([name, f"{1000 * cost.cpu_s:.1f}", f"{1000 * cost.wall_s:.1f}"])
     title = (
-        f"{args.model}, {len(names)} images of {height} x {width}, {args.device}, {args.threads} "
-        f"threads, torch {torch.__version__}"
+        f"{args.model}, {len(camera_names)} images of {height} x {width}, {args.device}, "
+        f"{args.threads} threads, torch {torch.__version__}"
     )
     table = markdown_table(["one frame", "processor, ms", "wall clock, ms"], rows)
     print(f"{title}\n\n{table}")

@@ -18,7 +18,9 @@ from gsmap.utils.parallel import ordered_map
 Result = TypeVar("Result")
 
 MIB = 2**20
-M_MMAP_THRESHOLD = -3  # parameter of glibc's mallopt
+# Parameter of glibc's `mallopt`: smallest size in bytes of a block that malloc maps separately. The
+# memory of such a block goes back to the system when the block is freed.
+M_MMAP_THRESHOLD = -3
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def measure(function: Callable[[], object], device: torch.device, repeats: int =
         RuntimeError: If the system does not report the peak memory of a process (only Linux with
             glibc does).
     """
-    function()
+    function()  # warm-up
     peak = _peak_bytes(function, device)
     wall_times = []
     cpu_times = []
@@ -93,13 +95,15 @@ def in_own_process(function: Callable[..., Result], *arguments: object) -> Resul
     Returns:
         Result of the function.
     """
-    # With one worker, the task would run in this process. With two, it starts one other process.
+    # With one worker, `ordered_map` would run the task in this process. With two, it starts one
+    # other process, since there is only one task. It yields one result, which is unpacked.
     call = partial(_call, function)
     (result,) = ordered_map(call, [arguments], workers=2, timeout_s=None)
     return result
 
 
 def _call(function: Callable[..., Result], arguments: tuple[object, ...]) -> Result:
+    """Call a function. Its arguments are one tuple, because a task is a single value."""
     return function(*arguments)
 
 
@@ -119,25 +123,26 @@ def _peak_bytes(function: Callable[[], object], device: torch.device) -> int:
         return torch.cuda.max_memory_allocated(device) - before
     if platform.system() != "Linux":
         raise WorkError("Peak memory on the CPU is read from /proc, which only Linux has.")
-    libc = ctypes.CDLL(None)
+    libc = ctypes.CDLL(None)  # the C library of this process
     # With this threshold, the memory of freed tensors goes back to the system. Otherwise, malloc
     # would keep it for reuse, and it would count as memory in use before the call.
     libc.mallopt(M_MMAP_THRESHOLD, 64 * 1024)
     libc.malloc_trim(0)
-    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    before = _status_bytes("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM to the memory in use
+    before = _status_bytes("VmRSS")  # memory in use; VmHWM is its peak
     function()
     # From here on, malloc keeps the memory of freed tensors for reuse again, as in a normal run.
     # The first call of `mallopt` has ended glibc's automatic choice of the threshold. 32 MiB is the
     # largest threshold that glibc would choose.
     libc.mallopt(M_MMAP_THRESHOLD, 32 * MIB)
+    # The counters of Linux are approximate, so the difference may be slightly negative.
     return max(_status_bytes("VmHWM") - before, 0)
 
 
 def _status_bytes(field: str) -> int:
     """Read a size in bytes from the status of this process."""
     for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(field + ":"):
+        if line.startswith(field + ":"):  # such as "VmRSS:   12345 kB", in units of 1024 bytes
             return int(line.split()[1]) * 1024
     raise WorkError(f"/proc/self/status has no {field}.")
 

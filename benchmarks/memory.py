@@ -9,8 +9,10 @@ from typing import Any
 from benchmarks.measure import in_own_process
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
-TRAINVAL_SAMPLES = 34_149
-_REFERENCES = {  # fields of each table that refer to other records
+TRAINVAL_SAMPLES = 34_149  # samples of nuScenes trainval, train and val together
+# Tables that are repeated, each with the fields that refer to other records. The remaining tables,
+# such as the sensors, are written once.
+_REFERENCES = {
     "sample": ("scene_token", "prev", "next"),
     "sample_data": ("sample_token", "ego_pose_token", "prev", "next"),
     "ego_pose": (),
@@ -22,12 +24,13 @@ _SWEEPS_PER_SAMPLE = 9
 def tile_tables(source: Path, version: str, target: Path, copies: int) -> int:
     """Write a data root whose tables repeat the scenes of another one, without sensor files.
 
-    Each key frame of the LiDAR gets nine sweeps before it, as in nuScenes.
+    Each key frame of the LiDAR gets nine sweeps before it, as in nuScenes. All scenes belong to the
+    split ``train``.
 
     Args:
         source: Data root to repeat.
         version: Version folder of the data root.
-        target: Data root to write.
+        target: Data root to write; its version folder must not exist.
         copies: Number of repetitions, >= 1.
 
     Returns:
@@ -45,27 +48,32 @@ def tile_tables(source: Path, version: str, target: Path, copies: int) -> int:
     _add_sweeps(tables)
     for name, records in tables.items():
         (target / version / f"{name}.json").write_text(json.dumps(records))
+    # The conversion reads the splits from this file instead of using the official ones.
     scene_names = [scene["name"] for scene in tables["scene"]]
     (target / version / "splits.json").write_text(json.dumps({"train": scene_names}))
     return len(tables["sample"])
 
 
 def _rename(record: dict[str, Any], references: tuple[str, ...], copy: int) -> dict[str, Any]:
-    """Copy a record, and append the number of the copy to its token, its name and references."""
+    """Copy a record, and append the number of the copy to its token, name and references."""
     renamed = dict(record, token=f"{record['token']}_{copy}")
     if "name" in record:
         renamed["name"] = f"{record['name']}_{copy}"
     for key in references:
-        if record[key]:
+        if record[key]:  # `prev` and `next` are empty at the ends of a scene
             renamed[key] = f"{record[key]}_{copy}"
     return renamed
 
 
 def _add_sweeps(tables: dict[str, list[dict[str, Any]]]) -> None:
-    """Add sweeps before each key frame of the LiDAR, in place."""
+    """Add sweeps before each key frame of the LiDAR, in place.
+
+    Only the links ``prev`` are set, because the conversion follows only these links to the sweeps.
+    """
     poses = {pose["token"]: pose for pose in tables["ego_pose"]}
     sweeps = []
     for record in tables["sample_data"]:
+        # The record has no name of the sensor, but the path of its file contains the name.
         if "LIDAR_TOP" not in record["filename"] or not record["is_key_frame"]:
             continue
         previous_token = record["prev"]
@@ -93,7 +101,7 @@ def peak_of_conversion(root: Path, version: str, out_dir: Path) -> float:
         Peak memory of this process in MB.
     """
     convert_nuscenes(NuScenesOptions(root, version, out_dir=out_dir))
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux gives kB
 
 
 def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[str, float]:
@@ -102,7 +110,7 @@ def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[st
     Args:
         root: Data root to repeat.
         version: Version folder of the data root.
-        copies: Number of repetitions at the small and at the large size.
+        copies: Number of repetitions at the small and at the large size; the second is larger.
 
     Returns:
         Sizes, peaks in MB, growth in kB per sample, and the peak extrapolated to 34,149 samples in
@@ -115,7 +123,9 @@ def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[st
             target = Path(folder, "root")
             samples.append(tile_tables(root, version, target=target, copies=number))
             out = Path(folder, "out")
+            # The peak of a process never falls, so each size is measured in a fresh process.
             peaks.append(in_own_process(peak_of_conversion, target, version, out))
+    # In MB per sample.
     growth = (peaks[1] - peaks[0]) / (samples[1] - samples[0])
     return {
         "samples_small": samples[0],

@@ -26,15 +26,18 @@ from benchmarks.measure import markdown_table
 from gsmap.utils.errors import InputError
 from gsmap.utils.shipped import shipped_path
 
-REPO = shipped_path()
-TESTS = {"mapdata": "map_data", "drivemaps": "drive_maps"}  # test folders with another name
+REPO = shipped_path()  # root folder of the repository
+# Folder of tests of each room whose tests have another name than the room, below `tests`.
+TESTS = {"mapdata": "map_data", "drivemaps": "drive_maps"}
+# Folders of the packages, below `projects`.
 FOLDERS = ("GSMap/gsmap", "MapData/mapdata", "DriveMaps/drivemaps")
 ROOMS = ("models", "ops", "structures", "evaluation", "datasets", "mapdata", "drivemaps")
-CAUGHT = "caught"
-SURVIVED = "not caught"
+CAUGHT = "caught"  # a test has failed
+SURVIVED = "not caught"  # all tests have passed
 LATE = "timed out"
 VERDICTS = (CAUGHT, SURVIVED, LATE)
-# Modules that are imported once, before the child processes fork.
+# Modules that are imported once, before the child processes fork. None of them imports a module of
+# a room, which would stay unchanged in the child processes.
 PRELOADED = ["gsmap", "pytest", "scipy.ndimage", "shapely", "mmdet3d.models", "mmdet3d.datasets"]
 # Replacement of each operator (`OPERATORS`) and of each function name (`NAMES`).
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
@@ -77,13 +80,14 @@ def run(args: argparse.Namespace) -> None:
             modules[name] = path
             for index in range(count_places(path.read_text())):
                 places.append((name, index))
-        # `args.number` mutants are spread evenly. If the division leaves a remainder of n, each of
-        # the last n rooms gets one mutant more, so that the sum over the rooms is `args.number`.
+        # `args.number` mutants are spread evenly. If the division leaves a remainder of n,
+        # `room_index` gives one mutant more to each of the last n rooms, so that the rooms together
+        # get `args.number`.
         num_mutants = (args.number + room_index) // len(args.rooms)
         order = rng.permutation(len(places))
-        # No module has an empty name, so these tests run on the unchanged code.
-        unchanged = verdict(module="", source="", tests=tests_of(room, None), seconds=None)
-        if unchanged != SURVIVED:
+        # No module has an empty name, so these tests run on the unchanged code. They must pass.
+        verdict_unchanged = verdict(module="", source="", tests=tests_of(room, None), seconds=None)
+        if verdict_unchanged != SURVIVED:
             raise InputError(f"the tests of {room} fail without a mutation: repair them first.")
         verdicts = []
         for k in order[:num_mutants]:
@@ -111,10 +115,13 @@ def modules_of(room: str) -> dict[str, Path]:
     modules = {}
     for folder in FOLDERS:
         root = REPO / "projects" / folder
+        # The rooms `mapdata` and `drivemaps` are whole packages. The other rooms are folders of
+        # `gsmap`, so the folder does not exist in other packages, and no file is found there.
         room_folder = root if root.name == room else root / room
         for path in sorted(room_folder.rglob("*.py")):
             parts = path.relative_to(root.parent).with_suffix("").parts
             name = ".".join(parts).removesuffix(".__init__")
+            # A file that imports a compiler has its name as a word between blanks.
             words = set(path.read_text().split())
             if not {"numba", "triton"} & words and tests_of(room, name):
                 modules[name] = path
@@ -175,9 +182,11 @@ def _places(tree: ast.AST) -> Iterator[tuple[ast.expr, dict[str, object]]]:
     Type annotations, decorators, ``raise`` statements and f-strings are not changed.
 
     Yields:
-        An expression, and the new value of each of its fields that the change sets.
+        An expression, and the fields that the change sets: their new values by name.
     """
     skipped_nodes: set[ast.AST] = set()
+    # `ast.walk` yields a node before all nodes below it. Nodes that a node excludes are therefore
+    # in `skipped_nodes` when their turn comes.
     for node in ast.walk(tree):
         skipped_parts = [getattr(node, name, None) for name in ("annotation", "returns")]
         skipped_parts += getattr(node, "decorator_list", [])
@@ -196,7 +205,7 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
     match node:
         case ast.Compare(ops=ops):
             changes: list[dict[str, object]] = []
-            for k, op in enumerate(ops):
+            for k, op in enumerate(ops):  # several operators for `low <= x < high`
                 changed_op = OPERATORS[type(op)]()
                 changes.append({"ops": [*ops[:k], changed_op, *ops[k + 1 :]]})
             return changes
@@ -223,7 +232,7 @@ def verdict_of_room(room: str, module: str, source: str, seconds: float) -> str:
         room: One of ``ROOMS``.
         module: Name of the module.
         source: Source of the mutant.
-        seconds: Time limit of each of the two groups of tests.
+        seconds: Time limit in seconds of each of the two groups of tests.
 
     Returns:
         One of ``VERDICTS``.
@@ -242,40 +251,47 @@ def verdict(module: str, source: str, tests: Sequence[str], seconds: float | Non
     """Run tests in a child process in which one module has another source.
 
     Args:
-        module: Name of the module.
+        module: Name of the module; empty to change no module.
         source: Source of the mutant.
         tests: Paths of the test files.
-        seconds: Time limit; None for no limit.
+        seconds: Time limit in seconds; None for no limit.
 
     Returns:
         One of ``VERDICTS``.
     """
+    # A server process imports the modules of `PRELOADED` once and forks a child for each call. It
+    # imports no module of a room, so each child imports the changed module itself.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     child = context.Process(target=_run_tests, args=(module, source, tests))
     child.start()
     child.join(seconds)
     if child.exitcode is None:  # the child still runs after the time limit
-        with suppress(ProcessLookupError):  # the child has no process group yet
+        # End the child and the processes that the tests have started. `killpg` raises
+        # ProcessLookupError if the child has not created its process group yet.
+        with suppress(ProcessLookupError):
             # The child was started, so `pid` is not None; `or 0` is only for the type checker.
             os.killpg(child.pid or 0, signal.SIGKILL)
-        child.kill()
+        child.kill()  # in case that the child had no group
         child.join()
         return LATE
+    # The exit code is 0 if all tests have passed. Other codes mean a failed test, or an error.
     return CAUGHT if child.exitcode else SURVIVED
 
 
 def _run_tests(module: str, source: str, tests: Sequence[str]) -> None:
-    """Run pytest in this process, which imports the mutant."""
+    """Run pytest in this process, which imports the mutant, and exit with the code of pytest."""
     os.setsid()  # a process group, so that `verdict` can end the processes of the tests as well
     sys.meta_path.insert(0, _Finder(module, source))
     sink = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 1)
-    os.dup2(sink, 2)
+    os.dup2(sink, 1)  # standard output
+    os.dup2(sink, 2)  # standard error
     import pytest
 
+    # The tests end at the first failure (-x). They run in this process alone, without the processes
+    # of xdist, in which the finder of the mutant would be missing. The cache would write files.
     options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(REPO)]
-    options += ["-m", ""]  # also runs the tests that are marked, such as tests of faults
+    options += ["-m", ""]  # also runs tests that pyproject.toml excludes by their mark (`faults`)
     sys.exit(pytest.main([*options, *tests]))
 
 
@@ -295,6 +311,8 @@ class _Finder:
         self, name: str, path: Sequence[str] | None, _: object = None
     ) -> ModuleSpec | None:
         """Return the module's import spec with a loader of the mutant; None for other modules.
+
+        Python calls it for each module that is imported. After None it asks the next finder.
 
         Args:
             name: Name of a module.

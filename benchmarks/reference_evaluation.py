@@ -28,6 +28,7 @@ from gsmap.structures.elements import MapElements
 
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth
 _OPENCV_VERSION = tuple(int(part) for part in cv2.__version__.split(".")[:2])
+# The tuples are the major and the minor version.
 FILLS_AS_RELEASED = (4, 8) <= _OPENCV_VERSION <= (4, 10)
 """Whether the installed OpenCV fills polygons like the versions of the published AP_raster."""
 
@@ -41,7 +42,7 @@ def _resample(line: np.ndarray) -> np.ndarray:
 
 
 def _strip(line: np.ndarray) -> Any:
-    """Polygon of 4 m width around a polyline (P, 2) in metres."""
+    """Shapely polygon of 4 m width around a polyline (P, 2) in metres."""
     return shapely.LineString(line).buffer(2.0, cap_style="flat", join_style="mitre")
 
 
@@ -63,11 +64,13 @@ def _chamfer_hits(pred: list[np.ndarray], gt: list[np.ndarray], threshold: float
     tree = shapely.STRtree(strips)
     for i, line in enumerate(pred):
         strip = _strip(line)
-        for k in tree.query(strip):
+        for k in tree.query(strip):  # strips whose bounding boxes touch
             if strips[k].intersects(strip):
-                points = cdist(line, gt[k])
-                distances[i, k] = (points.min(axis=0).mean() + points.min(axis=1).mean()) / 2
-    matched = set()
+                point_distances = cdist(line, gt[k])  # (100, 100)
+                to_gt = point_distances.min(axis=1).mean()
+                from_gt = point_distances.min(axis=0).mean()
+                distances[i, k] = (from_gt + to_gt) / 2
+    matched = set()  # indices of the ground truths that have a match
     hits = []
     for distances_to_gt in distances:
         hit = False
@@ -98,7 +101,7 @@ def chamfer_map(
         thresholds: Thresholds in metres.
 
     Returns:
-        Mean over classes and thresholds, in [0, 1].
+        Mean over classes and thresholds, in [0, 1]. A class without ground truth counts as 0.
     """
     aps = []
     for label in range(num_classes):
@@ -129,19 +132,22 @@ def _encode_masks(
 
     Args:
         elements: All elements of a frame.
-        rows: Indices of the elements to encode. (n,)
-        polygon: Whether to draw the elements as filled polygons; otherwise, as lines.
+        rows: Indices of the elements to encode, all of one class. (n,)
+        polygon: Whether to draw the elements as filled polygons; otherwise, as lines. It is the
+            setting of their class in ``config``.
         config: Rules of AP_raster.
         by_opencv: Whether OpenCV fills polygons, instead of the rasterizer of `gsmap.evaluation`.
 
     Returns:
-        One code of pycocotools per element.
+        One code per element, a dictionary of pycocotools.
     """
     width, height = config.size_px
     if polygon and not by_opencv:
-        words = rasterize(elements.select(rows), config)
-        # A word has one bit per column, the first column lowest; the last word has unused bits.
+        words = rasterize(elements.select(rows), config)  # dilated masks. (n, H, words)
+        # A word has one bit per column, and the lowest bit is the first column. The last word may
+        # have unused bits, which are cut off below.
         bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")
+        # `run_length.encode` requires Fortran order.
         return [run_length.encode(np.asfortranarray(mask)) for mask in bits[..., :width]]
     codes = []
     for i in rows:
@@ -201,6 +207,7 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig, by_opencv: bool = 
         ious = []
         num_gts = 0
         for pred, gt in frames:
+            # Best predictions of the class, by the limits of AP_raster on score and number.
             rows = _rank(pred, label, minimum=MIN_SCORE)[:MAX_PREDICTIONS]
             truths = np.flatnonzero(gt.labels == label)
             num_gts += len(truths)
@@ -214,6 +221,7 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig, by_opencv: bool = 
             frame_ious = run_length.iou(pred_codes, gt_codes, is_crowd)
             confidences.append(pred.confidence[rows])
             ious.append(np.asarray(frame_ious).reshape(len(rows), len(truths)))
+        # Hits are listed frame by frame; `order` sorts the hits of all frames by score.
         order = np.argsort(-np.concatenate(confidences), kind="stable")
         for threshold in thresholds:
             hits: list[bool] = []

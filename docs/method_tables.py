@@ -25,14 +25,18 @@ def overview_table() -> str:
 
 
 def _overview_row(method: Method) -> tuple[str, ...]:
-    """Row of a method in the first table."""
+    """Row of a method in the first table.
+
+    The entries ``source`` (equations of the paper), ``page`` (address of the documentation) and
+    ``parameters_note`` of the overview are optional.
+    """
     paper = method.paper()
     overview = paper["overview"]
     source = f", {overview['source']}" if "source" in overview else ""
     arxiv = f"[{paper['arxiv']}](https://arxiv.org/abs/{paper['arxiv']})"
     page = overview.get("page", f"methods/{method.name}.md")
-    counts = [f"{count:,}" for count in paper["parameters"].values()]
-    if len(counts) > 1:  # several configs, which are told apart by their names
+    counts = [f"{count:,}" for count in paper["parameters"].values()]  # one for each config
+    if len(counts) > 1:  # the name of its config is put before each number
         counts = [
             f"`{Path(config).stem}` {count}"
             for config, count in zip(paper["parameters"], counts, strict=True)
@@ -50,6 +54,7 @@ def precision_table() -> str:
     """Table of the published AP_chamfer / AP_raster on nuScenes after 24 and after 110 epochs."""
     rows = []
     for method in METHODS:
+        # Two texts, one for each number of epochs. Methods without published figures have no row.
         figures = method.paper()["overview"].get("average_precision")
         if figures:
             rows.append((method.title, *figures))
@@ -63,16 +68,18 @@ def _table(header: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def with_tables(text: str) -> str:
-    """Replace the tables between the markers of a page.
+    """Replace the tables in the text of the page, each between its two markers.
 
     Raises:
-        ValueError: If the page lacks the markers of a table.
+        ValueError: If the markers of a table are missing or occur several times.
     """
     for name, table in (("overview", overview_table()), ("precision", precision_table())):
-        start, end = f"<!-- {name}: docs/method_tables.py -->\n", f"<!-- end of {name} -->\n"
+        start = f"<!-- {name}: docs/method_tables.py -->\n"
+        end = f"<!-- end of {name} -->\n"
         pattern = re.compile(f"{re.escape(start)}.*?{re.escape(end)}", re.DOTALL)
-        text, found = pattern.subn(lambda _, block=start + table + end: block, text)
-        if found != 1:
+        # A function returns the new block, because `subn` would interpret backslashes in a text.
+        text, num_replaced = pattern.subn(lambda _, block=start + table + end: block, text)
+        if num_replaced != 1:
             raise ValueError(
                 f"{PAGE} needs one pair of the markers {start.strip()} ... {end.strip()}."
             )

@@ -22,6 +22,7 @@ from gsmap.visualization.figure import save_figure
 
 
 def parse_args() -> argparse.Namespace:
+    # `output_file` returns a path, after a check that the file can be written.
     parser = CommandParser(description=__doc__)
     parser.add_argument(
         "runs", nargs="+", type=Path, help="work folders of runs, or scalars.json files"
@@ -39,15 +40,16 @@ def parse_args() -> argparse.Namespace:
 
 def main() -> None:
     args = parse_args()
-    names = args.names or [None] * len(args.runs)
+    names = args.names or [None] * len(args.runs)  # None selects the name of the folder of a run
     if len(names) != len(args.runs):
         raise InputError(f"--names gives {len(names)} names for {len(args.runs)} runs.")
     runs = [read_run(path, name) for path, name in zip(args.runs, names, strict=True)]
-    table = summary_table(runs)
+    table = summary_table(runs)  # Markdown text
     print(table)  # before anything is written: a disk may be full
     if args.table:
         write_text(args.table, table + "\n")
     if args.out:
+        # `plot_series` draws the values of --keys. `plot_runs` draws losses and validation metrics.
         figure = plot_series(runs, args.keys) if args.keys else plot_runs(runs)
         print(f"curves: {save_figure(figure, args.out)}")
 

@@ -92,7 +92,13 @@ def parse_args() -> argparse.Namespace:
 
 
 def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
-    """Tables whose name matches a shell pattern.
+    """Tables of the papers whose name matches a shell pattern.
+
+    Returns:
+        Tables with their name (``table``), ``columns`` and ``rows``. A row has its name (``row``),
+        the ``config`` and its overrides (``options``), the published figures in the order of the
+        columns (``paper``, None without figures), and in some cases a ``note``. The config is None
+        if the library has none for the row; the note then gives the reason.
 
     Raises:
         ValueError: If no table matches.
@@ -118,6 +124,10 @@ def _add_rows(table: dict[str, Any], papers: Iterable[dict[str, Any]]) -> dict[s
     Args:
         table: Table with ``variants``: the overrides of the configs by the name of the variant.
         papers: Contents of the ``paper.json`` of all methods.
+
+    Returns:
+        Copy of the table with a row for each pair of variant and model. No figures are published
+        for these rows.
     """
     configs: dict[str, str] = {}  # by name of the model
     for paper in papers:
@@ -168,7 +178,12 @@ def listing(tables: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def slurm_commands(runs: list[Run], partition: str) -> str:
-    """Commands for the unfinished runs, one per line: this command with ``--only`` for each run."""
+    """Commands for the unfinished runs, one per line: this command with ``--only`` for each run.
+
+    Args:
+        runs: All runs of the comparison.
+        partition: Partition of the Slurm cluster.
+    """
     # A parser with the single option --slurm returns all other words of this command line.
     slurm_option = argparse.ArgumentParser(add_help=False)
     slurm_option.add_argument("--slurm")
@@ -184,13 +199,18 @@ def slurm_commands(runs: list[Run], partition: str) -> str:
 
 def train(runs: list[Run]) -> None:
     """Train and test the unfinished runs, and print how each run ended."""
+    # `execute` yields a run when it has ended. Its state is "done" or a sentence about the failure.
     for run, state in execute(runs):
-        Progress.write(f"{run.label}: {state}")
+        Progress.write(f"{run.label}: {state}")  # does not break a progress bar
         sys.stdout.flush()
 
 
 def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
     """Write tables and plots of all runs.
+
+    Args:
+        runs: Planned runs, trained or failed.
+        args: Options of the command. ``args.runs`` names work folders of further finished runs.
 
     Returns:
         The tables, in Markdown.
@@ -198,13 +218,16 @@ def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
     results = [read_result(run.name, run.folder, run.seed) for run in runs]
     for text in args.runs:
         name, _, folder = text.partition("=")
+        # Without "=", `folder` is empty and means the working folder.
         if not Path(folder or ".", "metrics.json").is_file():
             raise FileNotFoundError(
                 f"{text!r} names no finished run: write NAME=DIR, where DIR holds metrics.json "
                 "(tools/test.py --metrics-out)."
             )
         results.append(read_result(name, Path(folder)))
-    check_one_test_set(results)
+    check_one_test_set(results)  # raises an error if numbers of test samples or elements differ
+    # Scores the runs again by the rules of --rescore, if any, and returns reports for the
+    # precision-recall curves by name of the config.
     reports = apply_rescoring(results, args.rescore or {})
     rules = ", ".join(f"{key} {value}" for key, value in (args.rescore or {}).items())
     title = f"Comparison under {rules}" if rules else "Comparison"
@@ -227,6 +250,7 @@ def main() -> str:
         return "\n".join(listing(read_tables(args.tables)))
     runs: list[Run] = []
     if args.configs:
+        # Overrides that set the data root of every split.
         data_options = data_root_options(args.data_root) if args.data_root else {}
         options = [f"{key}={value}" for key, value in data_options.items()]
         protocol = Protocol(
@@ -240,7 +264,8 @@ def main() -> str:
         runs = plan([parse_entry(text) for text in args.configs], protocol)
     if args.slurm:
         return slurm_commands(runs, args.slurm)
-    chosen = [run for run in runs if args.only in (None, run.label)]  # all without --only
+    # Without --only, `args.only` is None, and all runs are chosen.
+    chosen = [run for run in runs if args.only in (None, run.label)]
     if args.only and not chosen:
         labels = [run.label for run in runs]
         raise InputError(f"no run has the name {args.only}; there are {labels}.")
@@ -249,6 +274,7 @@ def main() -> str:
     tables = "" if args.only else tabulate(runs, args)
     failed = [run.label for run in chosen if not run.is_done]
     if failed:
+        # The error ends the command with an exit code, so the tables are printed before it.
         sys.stdout.write(f"{tables}\n")
         raise WorkError(f"{', '.join(failed)} did not end: the table names the reason.")
     return tables

@@ -98,7 +98,11 @@ def open_samples(
         inferencer: The model with its config.
         args: The options of the command.
         source: The annotation file; None for the annotation file in the config.
-        split: ``train`` or ``test``: the data loader of the config whose file is used.
+        split: ``train`` or ``test``: the data loader of the config whose file is used if ``source``
+            is None.
+
+    Returns:
+        Data set of the samples with the test pipeline of the config.
 
     Raises:
         FileNotFoundError: If the file of the config does not exist.
@@ -117,6 +121,10 @@ def open_samples(
 def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInferencer:
     """Export the model in the chosen precision, and open the written file.
 
+    Args:
+        inferencer: The model with its config.
+        args: The options of the command.
+
     Raises:
         ValueError: If the config lists no cameras.
     """
@@ -126,7 +134,7 @@ def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInfe
     size = args.size
     if size is None:
         first_sample = open_samples(inferencer, args, args.samples, split="test")[0]
-        size = first_sample["inputs"]["img"].shape[-2:]
+        size = first_sample["inputs"]["img"].shape[-2:]  # rows and columns
     write = partial(
         export_onnx,
         inferencer.model,
@@ -137,6 +145,7 @@ def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInfe
     if not (args.fp16 or args.int8):
         write(args.out)
         return OnnxInferencer(args.out)
+    # The other precisions are converted from a file in single precision.
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
         single_precision = Path(folder, "fp32.onnx")
         write(single_precision)
@@ -164,7 +173,7 @@ def calibration_samples(
     """
     dataset = open_samples(inferencer, args, args.calibration, split="train")
     tokens = dataset.annotations.column("token")
-    chosen = select_samples(tokens, max_num=args.calibration_samples)
+    chosen = select_samples(tokens, max_num=args.calibration_samples)  # indices, evenly spread
     for _, inputs in graph_inputs(exported, dataset, chosen):
         yield inputs
 
@@ -181,14 +190,17 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
         A sentence with the largest differences.
     """
     dataset = open_samples(inferencer, args, args.samples, split="test")
+    # Indices of samples, evenly spread over the data set.
     chosen = select_samples(dataset.annotations.column("token"), max_num=args.check)
-    # Indices of the classes whose points the model reorders to form a short path.
+    # Indices of the classes whose points the model reorders to form a short path. The order is not
+    # compared, since rounding decides between paths of nearly equal length.
     unfolded = exported.metadata.get("unfold_classes", [])
-    in_torch = inferencer.predict(dataset, chosen)
-    samples = graph_inputs(exported, dataset, chosen)
-    differences = []
-    predictions = []
-    for sample, (token, inputs) in zip(in_torch, samples, strict=True):
+    # Both yield the chosen samples in one order: predictions of torch, and inputs of the graph.
+    torch_samples = inferencer.predict(dataset, chosen)
+    onnx_inputs = graph_inputs(exported, dataset, chosen)
+    differences = []  # largest differences of each sample: of scores, and of points in metres
+    predictions = []  # token and map elements of each sample, predicted by ONNX Runtime
+    for sample, (token, inputs) in zip(torch_samples, onnx_inputs, strict=True):
         elements = exported.elements(exported.run(inputs))
         expected = elements_of_predictions(sample.pred_instances_3d)
         differences.append(largest_differences(elements, expected, unfolded))
@@ -197,6 +209,7 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
         exported.write(args.results, predictions)
     # Differences are infinite if the numbers of elements of a class differ.
     finite_differences = [pair for pair in differences if np.isfinite(pair).all()]
+    # Without such a sample, the sentence reports 0.
     score, distance_m = np.max(finite_differences or [(0, 0)], axis=0)
     num_equal = len(finite_differences)
     return (

@@ -17,7 +17,9 @@ from gsmap.visualization.film import write_drive_film
 from gsmap.visualization.page.page import PageOptions, is_own_page, page_data, write_page
 
 _PAGE = Path("report.html")  # page to write without --out
-_IMAGE_WIDTH_PX = 320  # width without --image-width
+# Width of a page's images without --image-width. The option has no default, so that a film, to
+# which it does not apply, can refuse it.
+_IMAGE_WIDTH_PX = 320
 
 
 def parse_args() -> argparse.Namespace:
@@ -90,20 +92,25 @@ def parse_args() -> argparse.Namespace:
 
 
 def main() -> str:
-    # The page is read before `parse_args`, which declares it as an output that must not be read.
+    """Write the page or the film, and return a summary, which `run_command` prints."""
+    # Whether another program has written the default page. The file is read before `parse_args`:
+    # from then on, an output must not be read, because it could also be an input by mistake.
     is_foreign = _PAGE.exists() and not is_own_page(_PAGE)
     args = parse_args()
-    if args.out is _PAGE and is_foreign:  # without --out
+    # Without --out, `args.out` is the object `_PAGE` itself, the default. A user who gives the name
+    # of a page with --out may replace a file of another program.
+    if args.out is _PAGE and is_foreign:
         raise FileExistsError(f"{_PAGE} exists and is no page of this command: give --out PAGE.")
     paths = [args.results]
     if args.compare:
         paths.append(args.compare)
+    # By default, a result file is named FOLDER/NAME, without its suffix.
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     if len(names) != len(paths) or len(set(names)) != len(names):
         raise InputError(f"--names must give {len(paths)} different names, got {names}.")
     results = dict(zip(names, paths, strict=True))
     if args.no_images:
-        image_width_px = 0
+        image_width_px = 0  # leaves the images of a page out
     elif args.image_width is not None:
         image_width_px = args.image_width
     else:

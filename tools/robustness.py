@@ -36,7 +36,7 @@ KINDS = (
     "fog", "rain", "night", "motion_blur", "jpeg",
 )  # fmt: skip
 SEVERITIES = (1, 2, 3, 4, 5)
-CLEAN = "none"
+CLEAN = "none"  # key of the figures without corruption, which are measured once
 _DELAYED = "camera_delayed"
 
 
@@ -55,7 +55,7 @@ def parse_args() -> argparse.Namespace:
         action="store_true",
         help="score data of another split than the training split, although they may share places",
     )
-    add_config_options(parser)
+    add_config_options(parser)  # --cfg-options, --data-root and --image-scale
     args = parser.parse_args()
     args.kinds = list(dict.fromkeys(args.kinds))  # a kind that is given twice is measured once
     if args.samples is not None and args.samples < 1:
@@ -66,20 +66,23 @@ def parse_args() -> argparse.Namespace:
 def add_corruption(settings: Any, kind: str, severity: int, seed: int) -> dict[str, Any]:
     """Settings of a data set with a corruption in its pipeline.
 
-    The delay of cameras is inserted before the step that loads the images, and other corruptions
-    after it.
+    The delay of cameras replaces the paths of the images, so it is inserted before the step that
+    loads them. Other corruptions change the loaded images.
 
     Args:
         settings: Settings of the data set in a config.
         kind: One of ``KINDS``, or ``CLEAN`` for no corruption.
         severity: Severity of the corruption, 1 to 5.
         seed: Seed of the random numbers.
+
+    Raises:
+        ValueError: If the pipeline has no step ``LoadCameraImages``.
     """
     if kind == CLEAN:
         return dict(settings)
     steps = list(settings["pipeline"])
     types = [step["type"] for step in steps]
-    load = types.index("LoadCameraImages")
+    load_index = types.index("LoadCameraImages")
     if kind == _DELAYED:
         step = {
             "type": "DelayCameras",
@@ -88,10 +91,10 @@ def add_corruption(settings: Any, kind: str, severity: int, seed: int) -> dict[s
             "severity": severity,
             "seed": seed,
         }
-        steps.insert(load, step)
+        steps.insert(load_index, step)
     else:
         step = {"type": "CorruptImages", "kind": kind, "severity": severity, "seed": seed}
-        steps.insert(load + 1, step)
+        steps.insert(load_index + 1, step)
     return {**settings, "pipeline": steps}
 
 
@@ -108,13 +111,14 @@ def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[s
 
     dataset = DATASETS.build(settings)
     metric = METRICS.build({"type": "MapMetric", "eval": ["chamfer"]})
-    metric.dataset_meta = dataset.metainfo
+    metric.dataset_meta = dataset.metainfo  # classes and range, which a runner would set
     count = min(samples or len(dataset), len(dataset))
     indices = np.linspace(0, len(dataset) - 1, count).round().astype(int)
     for index in indices.tolist():
         predictions = model.test_step(pseudo_collate([dataset[index]]))
+        # The metric reads only the predictions, with their ground truth, and not the input batch.
         metric.process(None, [sample.to_dict() for sample in predictions])
-    figures = metric.evaluate(count)
+    figures = metric.evaluate(count)  # all samples that were processed
     aps = {}
     for name in dataset.metainfo["classes"]:
         aps[name] = 100 * figures[f"chamfer/{name}/AP"]
@@ -135,7 +139,7 @@ def mean_aps(figures: dict[str, list[dict[str, float]]], kind: str) -> list[floa
 
 def resilience(figures: dict[str, list[dict[str, float]]], kind: str) -> float:
     """Mean AP over the severities as a share of the AP without corruption, in percent."""
-    (clean,) = mean_aps(figures, CLEAN)
+    (clean,) = mean_aps(figures, CLEAN)  # a list of one value
     return 100 * float(np.mean(mean_aps(figures, kind))) / max(clean, 1e-9)
 
 
@@ -166,7 +170,10 @@ def earlier_figures(path: Path) -> dict[str, list[dict[str, float]]]:
 
 
 def are_figures(content: Any) -> bool:
-    """Whether the content of a file has the form of figures of this command."""
+    """Whether the content of a file has the form of figures of this command.
+
+    It has a list by corruption, with one dictionary of AP for each severity.
+    """
     if not isinstance(content, dict) or CLEAN not in content:
         return False
     for kind, rows in content.items():
@@ -206,10 +213,21 @@ def other_figures(
 
 
 def require_own_split(checkpoint: Path, settings: Any) -> None:
-    """Raise an error if the model was trained on another split list than the data set has."""
+    """Raise an error if the model was trained on another split list than the data set has.
+
+    A split list is the list of scenes that defines the splits of a data set.
+
+    Args:
+        checkpoint: File of the weights, which names the split list of the training.
+        settings: Settings of the data set in a config.
+
+    Raises:
+        ValueError: If both lists are known and differ.
+    """
     from gsmap.checkpoints.reading import read_checked
 
     meta = AnnotationFile(Path(settings["data_root"], settings["ann_file"])).meta
+    # Empty if the checkpoint names no list, or was trained on another data set.
     trained_on = read_checked(checkpoint).list_of(meta.dataset)
     require_same_list(trained_on, meta.split_list, f"{checkpoint}", "--allow-other-split")
 
@@ -223,6 +241,7 @@ def main() -> str:
     from gsmap.visualization.figure import save_figure
     from gsmap.visualization.plots import plot_severities
 
+    # Without a checkpoint in the options, this is the checkpoint of the named model.
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = load_model(args.config, checkpoint, device=device, cfg_options=args.cfg_options)
@@ -238,6 +257,7 @@ def main() -> str:
     cases = [(CLEAN, 1), *product(args.kinds, SEVERITIES)]
     measured: dict[str, list[dict[str, float]]] = {}
     with (
+        # No other process may write to the folder until the end of this context.
         lock_folder(args.out, ".robustness", "wait for its end, or give another --out"),
         Progress(total=len(cases), unit="corruptions") as bar,
         torch.no_grad(),
@@ -253,6 +273,7 @@ def main() -> str:
             if kind == CLEAN:  # the first case, so that an error comes before the long measurement
                 others = other_figures(earlier, measured[CLEAN], args)
         measured.update(others)
+        # In a fixed order, whether they were measured now or in an earlier run.
         figures = {kind: measured[kind] for kind in (CLEAN, *KINDS) if kind in measured}
         text = table(figures)
         write_text(args.out / "robustness.json", json.dumps(figures, indent=1) + "\n")

@@ -35,7 +35,7 @@ from gsmap.utils.shipped import shipped_path
 SETTINGS = "settings.json"  # settings at the start of a run; a later start must have equal ones
 RECORD = "run.json"  # machine, load, command and end of a run
 _MAX_DIFFERENCES = 10  # largest number of differences in a message
-_digest = cache(digest)  # computed once for a file that many runs share
+_digest = cache(digest)  # SHA-256 of a file, computed once for a file that many runs share
 _TRAINING_KEYS = (  # settings of a config that affect the training
     "model",
     "optim_wrapper",
@@ -71,7 +71,7 @@ def parse_entry(text: str) -> Entry:
     # it is a closing one.
     first, *options = re.split(r",(?![^\[(]*[\])])", text)
     name, separator, config = first.rpartition("=")
-    if not separator:
+    if not separator:  # no name is given
         name = Path(config).stem
     if not re.fullmatch(r"[\w.+-]+", name):
         raise InputError(f"{text!r}: a name holds letters, digits and . _ + - only, got {name!r}.")
@@ -120,6 +120,7 @@ class Run:
     @property
     def is_trained(self) -> bool:
         """Whether training has ended, with its last validation."""
+        # File that the training writes after each validation, with the iteration as its content.
         validated = self.folder / VALIDATED
         if not validated.is_file() or validated.read_text() != str(self.iterations):
             return False
@@ -139,14 +140,18 @@ class Run:
         logs = sorted(self.folder.glob("2*/vis_data/scalars.json"))
         if not logs:
             return 0
+        # Lines of the log end with their iteration, as in `"step": 100}`.
         steps = re.findall(r'"step": (\d+)}', logs[-1].read_text())
         return max(map(int, steps), default=0)
 
     def commands(self) -> dict[str, list[str]]:
-        """Commands that train and test the model, by stage."""
+        """Commands that train and test the model, by stage: ``train`` and ``test``.
+
+        The training continues from the last checkpoint in the work folder, if there is one.
+        """
         train = [str(shipped_path("tools/train.py")), self.config]
         train += ["--work-dir", str(self.folder), "--resume"]
-        python = [sys.executable, "-u"]
+        python = [sys.executable, "-u"]  # output is not buffered
         launcher = python
         if self.processes > 1:
             launcher = [str(shipped_path("tools/dist_run.sh")), str(self.processes)]
@@ -214,12 +219,14 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     for seed in range(protocol.seeds):
         for entry in entries:
             runs.append(_plan_run(entry, seed, protocol, processes))
+    # `differences` returns the unequal settings of two runs, with both values, by dotted name.
     for run in runs[1:]:
         _refuse_differences(
             differences(runs[0].settings["data"], run.settings["data"]),
             fault=f"{runs[0].label} and {run.label} use different data",
             remedy="Compare configs of one data set, split, range and class list.",
         )
+    # Other seeds need no check, since a seed changes the settings of all configs equally.
     runs_of_first_seed = runs[: len(entries)]
     for one, other in combinations(runs_of_first_seed, 2):
         if not differences(one.settings, other.settings):
@@ -236,10 +243,10 @@ def _processes(protocol: Protocol) -> int:
     """Number of processes of each run, which divides the batch."""
     if torch.cuda.device_count():
         return 1
-    candidates = []
+    candidates = []  # in order of preference; the first one that divides the batch is taken
     for path in protocol.out.glob(f"*/seed_*/{SETTINGS}"):  # earlier runs
         candidates.append(_read_settings(path)["processes"])
-    cores = len(os.sched_getaffinity(0))
+    cores = len(os.sched_getaffinity(0))  # cores that this process may use
     candidates.extend(range(cores, 0, -1))
     for number in candidates:
         if number > 0 and protocol.batch % number == 0:
@@ -250,31 +257,34 @@ def _processes(protocol: Protocol) -> int:
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
     """Plan one run. Its data set and its model are built once, so that faults are found early."""
     initial_weights = None
-    own_options = [  # overrides of the comparison; overrides of the user take precedence
+    # Overrides of the comparison. Overrides of the user come after them and take precedence.
+    comparison_options = [
         f"train_dataloader.batch_size={protocol.batch // processes}",
         "val_evaluator.eval=chamfer,raster",
         f"randomness.seed={seed}",
     ]
     if protocol.init is not None:
         initial_weights = find_checkpoint(protocol.init).resolve()
-        own_options.append(f"load_from={initial_weights}")
+        comparison_options.append(f"load_from={initial_weights}")
     user_options = (*entry.options, *protocol.options)
     # The config is read twice: the overrides added below depend on the data set and the schedule.
-    cfg = read_config(entry.config, parse_options([*own_options, *user_options]))
+    cfg = read_config(entry.config, parse_options([*comparison_options, *user_options]))
     epochs = _count_epochs(entry, cfg, protocol=protocol, processes=processes)
-    own_options.append(f"train_cfg.max_epochs={epochs}")
-    own_options.append(f"train_cfg.val_interval={max(1, epochs // 4)}")
+    comparison_options.append(f"train_cfg.max_epochs={epochs}")
+    comparison_options.append(f"train_cfg.val_interval={max(1, epochs // 4)}")
     for index, scheduler in enumerate(cfg.get("param_scheduler") or []):
+        # A cosine schedule over epochs must end with the training.
         if "T_max" in scheduler and scheduler.get("by_epoch", True):
-            own_options.append(f"param_scheduler.{index}.T_max={epochs}")
-    options = (*own_options, *user_options)
+            comparison_options.append(f"param_scheduler.{index}.T_max={epochs}")
+    options = (*comparison_options, *user_options)
     cfg = read_config(entry.config, parse_options(options))
     check_config(cfg)
     if cfg.train_cfg.max_epochs != epochs:
         raise InputError(f"{entry.name}: the budget decides train_cfg.max_epochs; leave it out.")
-    with building(cfg):
+    with building(cfg):  # adds the name of the config to errors
         MODELS.build(cfg.model)
-    dataset = plain(cfg.train_dataloader.dataset)
+    # `plain` copies settings as JSON types, so that they equal the settings read from a file.
+    dataset = plain(cfg.train_dataloader.dataset)  # a copy, so the config is not changed
     # The data may be moved to other paths; "data" below has a digest of its content.
     for key in ("data_root", "ann_file"):
         dataset.pop(key, None)
@@ -307,7 +317,7 @@ def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int)
     Raises:
         ValueError: If the budget is not a whole number of epochs.
     """
-    with building(cfg):
+    with building(cfg):  # adds the name of the config to errors
         num_samples = len(DATASETS.build(cfg.train_dataloader.dataset))
     samples_per_process = math.ceil(num_samples / processes)
     steps_per_epoch = math.ceil(samples_per_process / cfg.train_dataloader.batch_size)
@@ -323,6 +333,7 @@ def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int)
 def _data_settings(cfg: Config) -> dict[str, Any]:
     """Settings that identify the data of training and test."""
     settings: dict[str, Any] = {}
+    # Paths are left out, but the digests of the annotation files are included.
     for part in ("train", "test"):
         dataset = cfg[f"{part}_dataloader"].dataset
         path = Path(dataset.get("data_root", ""), dataset.ann_file)
@@ -333,7 +344,13 @@ def _data_settings(cfg: Config) -> dict[str, Any]:
 
 
 def _refuse_differences(unequal: Mapping[str, tuple[Any, Any]], *, fault: str, remedy: str) -> None:
-    """Raise an InputError that names unequal settings, if there are any."""
+    """Raise an InputError that names unequal settings, if there are any.
+
+    Args:
+        unequal: Both values of each unequal setting, by its name.
+        fault: Beginning of the message.
+        remedy: End of the message: advice to the user.
+    """
     if not unequal:
         return
     pairs = [f"{key}: {one} and {other}" for key, (one, other) in unequal.items()]

@@ -1,7 +1,8 @@
-"""Analyses of ``tools/evaluate.py``: intervals, groups, drives and Gaussians.
+"""Analyses of ``tools/evaluate.py``: intervals, groups, drives, changes and Gaussians.
 
-Modules that only one analysis needs are imported in its function, so that a plain evaluation starts
-quickly.
+``args`` are the options of that command; ``args.results`` is the result file, and
+``args.ground_truth`` the annotation file. Modules that only one analysis needs are imported in its
+function, so that a plain evaluation starts quickly.
 """
 
 import argparse
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from gsmap.evaluation.analysis.bootstrap import Resamples
     from gsmap.evaluation.analysis.groups import Groups
 
-DEFAULT_RESAMPLES = 1000
+DEFAULT_RESAMPLES = 1000  # number of resamples without a number in the options
 
 
 def open_pairs(
@@ -43,6 +44,9 @@ def open_pairs(
         results: The result file.
         classes: Names of the classes.
         gaussians: Whether to read the Gaussians of the results.
+
+    Returns:
+        Iterable of samples with predictions and ground truth. It can be iterated only once.
     """
     return SamplePairs(
         results,
@@ -80,11 +84,16 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
         thresholds=tuple(args.thresholds or CHAMFER_THRESHOLDS),
     )
     figures = evaluate_drives(args.results, annotations, config=config, tracks_file=args.tracks)
+    # `groups` and `detections` concern metrics with an AP.
     return MetricReport("consistency", groups={}, metrics=figures, detections={})
 
 
 def change_report(args: argparse.Namespace) -> MetricReport:
-    """Print precision and recall of the changes of a GeoJSON file."""
+    """Print precision and recall of changes of the map.
+
+    ``args.results`` is the GeoJSON file of the changes that were found, and ``args.changes`` the
+    file of the true changes.
+    """
     from gsmap.evaluation.analysis.change_files import KINDS, read_changes
     from gsmap.evaluation.analysis.changes import change_figures
 
@@ -93,15 +102,17 @@ def change_report(args: argparse.Namespace) -> MetricReport:
             f"--changes needs poses, which {args.ground_truth} has not: give the annotation file "
             "(.arrow)."
         )
-    found = read_changes(args.results)
-    truth = read_changes(args.changes)
+    found_changes = read_changes(args.results)
+    true_changes = read_changes(args.changes)
     annotations = AnnotationFile(args.ground_truth)
-    figures = change_figures(found, truth, annotations, found_file=args.results)
+    figures = change_figures(found_changes, true_changes, annotations, found_file=args.results)
     rows = []
+    # For "all", a found change must have the kind of the true one. For "any_kind", it need not.
     for name in (*KINDS, "all", "any_kind"):
         row = [name.replace("_", " ")]
         for key in ("precision", "recall"):
             value = figures[f"{name}/{key}"]
+            # The value is undefined if there is no change to count.
             row.append("-" if value == UNDEFINED else f"{100 * value:.1f}")
         # "any_kind" counts all changes, and `figures` has these numbers only for "all".
         counted = "all" if name == "any_kind" else name
@@ -122,7 +133,9 @@ def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> Me
         rules = ChamferConfig.from_settings(settings)
     pairs = open_pairs(args, args.results, classes=classes, gaussians=True)
     vertices = calibration.matched_vertices(pairs, rules)
-    law = args.law or law_of(pairs.about)  # distribution of the errors: "normal" or "laplace"
+    # Distribution of the errors: "normal" or "laplace". The metadata `about` are complete only
+    # after `matched_vertices` has iterated over the pairs.
+    law = args.law or law_of(pairs.about)
     if args.reliability:
         from gsmap.visualization.figure import save_figure
         from gsmap.visualization.plots import plot_uncertainty
@@ -135,7 +148,10 @@ def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> Me
 
 
 def read_resamples(args: argparse.Namespace) -> "Resamples | None":
-    """Create resamples of the scenes of the ground truth; None if no option needs intervals."""
+    """Create random resamples of the scenes of the ground truth; None if no option needs intervals.
+
+    Intervals are the spread of an AP over the resamples (bootstrap).
+    """
     if args.bootstrap is None and not args.against:
         return None
     from gsmap.evaluation.analysis.bootstrap import Resamples
@@ -160,7 +176,8 @@ def interval_report(
         args: The options of the command.
 
     Returns:
-        The ends of the intervals. The keys of differences have the prefix ``minus_other/``.
+        The ends ``low`` and ``high`` of the intervals. For differences, whose keys have the prefix
+        ``minus_other/``, also the ``value``.
     """
     from gsmap.evaluation.analysis.bootstrap import (
         ap_differences,
@@ -169,30 +186,33 @@ def interval_report(
     )
 
     reports, notes = evaluation
-    source = f"of {resamples.count} resamples of the scenes, seed {resamples.seed}"
+    origin = f"of {resamples.count} resamples of the scenes, seed {resamples.seed}"
     figures = {}
     intervals = ap_intervals(reports, resamples)
-    print(format_intervals(intervals, f"AP with intervals of 95 % {source}") + "\n")
+    print(format_intervals(intervals, f"AP with intervals of 95 % {origin}") + "\n")
     for key, interval in intervals.items():
-        for part, value in vars(interval).items():
-            if part != "value":  # the report of the metric has it
-                figures[f"{key}/{part}"] = value
+        for field, value in vars(interval).items():
+            if field != "value":  # the report of the metric has it
+                figures[f"{key}/{field}"] = value
     if others is not None:
         other_reports, other_notes = others
-        # As in `reports`, only metrics with an AP are compared.
+        # As in `reports`, only metrics with an AP are compared. Only their reports have detections.
         ranked = [report for report in other_reports if report.detections]
         notes.extend(f"{args.against}: {note}" for note in other_notes)
         differences = ap_differences(reports, ranked, resamples)
-        title = f"{args.results} minus {args.against}, {source}"
+        title = f"{args.results} minus {args.against}, {origin}"
         print(format_intervals(differences, title, signed=True) + "\n")
         for key, interval in differences.items():
-            for part, value in vars(interval).items():
-                figures[f"minus_other/{key}/{part}"] = value
+            for field, value in vars(interval).items():
+                figures[f"minus_other/{key}/{field}"] = value
     return MetricReport("intervals", groups={}, metrics=figures, detections={})
 
 
 def read_groups(args: argparse.Namespace) -> "Groups | None":
-    """Read the groups of samples; None without ``--by``, and for ``--by distance``."""
+    """Read the group of each sample; None without ``--by``, and for ``--by distance``.
+
+    Distances divide the map of each sample, not the samples.
+    """
     if args.by in (None, DISTANCE):
         return None
     from gsmap.evaluation.analysis import groups
@@ -209,8 +229,9 @@ def group_report(
     """Print the AP of each group of samples, or of each band of distances from the vehicle.
 
     Args:
-        reports: Reports of metrics with an AP.
-        groups: Groups of the samples; None cuts the map into bands of distances.
+        reports: Reports of metrics with an AP; not used if ``groups`` is None.
+        groups: Groups of the samples; None cuts the map into bands of distances, which are matched
+            again.
         args: The options of the command.
         evaluator: The metrics and their rules.
     """
@@ -223,6 +244,7 @@ def group_report(
         evaluator = MapEvaluator(*ap_metrics, ground_truth_points=evaluator.ground_truth_points)
         classes = evaluator.classes
         pairs = open_pairs(args, args.results, classes=classes)
+        # Each sample becomes one sample per band, and the bands become the groups.
         pieces = cut_by_distance(pairs, polygon_labels(args, classes))
         reports = evaluator.reports(match_samples(pieces, evaluator, args.workers))
         groups = distance_groups(reports[0].tokens)

@@ -1,4 +1,9 @@
-"""Changes of the areas of one class between an old map and new drives."""
+"""Changes of the areas of one class between an old map and new drives.
+
+A pass is one drive past the place, with the map made from it. A view is a frame that has an area in
+range. An area is compared with the areas in the maps of the passes, and with the areas that single
+frames predict, its detections.
+"""
 
 from dataclasses import dataclass, field
 
@@ -23,9 +28,9 @@ from drivemaps.truth import polygons_of
 from gsmap.structures.elements import BoolArray, FloatArray, MapElements
 
 _MIN_OVERLAP = 0.3  # two areas are one object if they share at least this part of the smaller one
-_MIN_SHARE = 0.8  # an area is in view if at least this part of its outline is
+_MIN_SHARE = 0.8  # a pass has an area in view if it has at least this part of the outline in view
 _MIN_MOVE_M = 0.75  # an area has moved if its centre is shifted by at least this
-_MIN_FRAMES = 3  # smallest number of detections that can show that an area has moved
+_MIN_FRAMES = 3  # smallest number of frames with a detection that can show that an area has moved
 _STEP_M = 1.0  # largest distance between successive points of an outline
 
 
@@ -60,7 +65,7 @@ def area_changes(
         config: Parameters of merging, for the variances of predictions.
 
     Returns:
-        Removed, moved and added areas.
+        Removed and moved areas in the order of the old map, then added areas.
     """
     new_areas = [_areas_of(one_pass.elements, label) for one_pass in passes]
     detections = _detections(passes, label=label, config=config)
@@ -92,9 +97,10 @@ def area_changes(
         elif num_in_view and len(matches.scores) >= _MIN_FRAMES:
             new_area = _largest_overlap(area, new_areas)
             shift = _shift_of(area, matches)
+            # `exceeds` also requires that the shift is large compared to its standard error.
             if new_area is None or not shift.exceeds(_MIN_MOVE_M):
                 continue
-            share = smooth_share(score_sum, views)
+            share = smooth_share(score_sum, views)  # of the frames that detect the area
             change = Change(
                 MOVED,
                 label,
@@ -128,7 +134,8 @@ def _added(
             # The map of a pass is 2D, so there are no heights to leave out as in `_scored_areas`.
             for area in _polygons([line]):
                 outline = _outline(area)
-                # The old map gives no information about ground far from all of its elements.
+                # The old map gives no information about ground far from all of its elements, so
+                # nothing there counts as added.
                 if _overlaps(area, known_areas) or not on_known_ground(outline, old).any():
                     continue
                 in_view = _passes_in_view(outline, passes)
@@ -159,11 +166,12 @@ def _added(
 def _polygons(rings: list[FloatArray]) -> list[shapely.Polygon]:
     """Convert rings to valid polygons, with `polygons_of`.
 
-    A ring that crosses itself becomes several polygons. `polygons_of` would make one multipolygon.
+    A ring that crosses itself becomes several polygons. `polygons_of` returns one multipolygon for
+    it, and omits rings with a tiny area.
     """
     polygons = []
     for part in shapely.get_parts(np.array(polygons_of(rings), dtype=object)):
-        if isinstance(part, shapely.Polygon):
+        if isinstance(part, shapely.Polygon):  # the repair of a ring may also give lines
             polygons.append(part)
     return polygons
 
@@ -190,6 +198,7 @@ def _outline(area: shapely.Polygon) -> FloatArray:
 
 def _overlaps(area: shapely.Polygon, others: list[shapely.Polygon]) -> bool:
     """Whether an area and any of some others are one object."""
+    # The initial value is the maximum if there are no others.
     return bool(_shared_shares(area, others).max(initial=0.0) >= _MIN_OVERLAP)
 
 
@@ -201,18 +210,21 @@ def _passes_that_have(
 
 
 def _shared_shares(area: shapely.Polygon, others: list[shapely.Polygon]) -> FloatArray:
-    """Overlap of an area with each of n others, as a share of the smaller one of both. (n,)"""
+    """Overlap of an area with each of n others, as a share of the smaller of the two. (n,)"""
     shapes = np.array(others, dtype=object)
     shared_m2 = shapely.area(shapely.intersection(area, shapes))
     smaller_m2 = np.minimum(area.area, shapely.area(shapes))
-    shares: FloatArray = shared_m2 / np.maximum(smaller_m2, 1e-9)
+    shares: FloatArray = shared_m2 / np.maximum(smaller_m2, 1e-9)  # no division by 0
     return shares
 
 
 def _largest_overlap(
     area: shapely.Polygon, areas_of_passes: list[list[shapely.Polygon]]
 ) -> shapely.Polygon | None:
-    """Find the new area that overlaps most with an area; None if all are different objects."""
+    """Find the new area that overlaps most with an old area.
+
+    None if all new areas are other objects, by `_MIN_OVERLAP`.
+    """
     best = None
     largest_share = _MIN_OVERLAP
     for areas in areas_of_passes:
@@ -242,8 +254,9 @@ def _detections(passes: list[Pass], label: int, config: MergeConfig) -> list[_De
             variances = []
             for index in np.flatnonzero(elements.labels == label).tolist():
                 vertices = slice(elements.offsets[index], elements.offsets[index + 1])
-                # An area that crosses itself becomes one multipolygon here. Its parts are not
-                # separated as in `_polygons`, because only overlaps and the centre are used.
+                # The ring gives one area, or none if its area is tiny. A ring that crosses itself
+                # becomes one multipolygon. Its parts are not separated as in `_polygons`, because
+                # only overlaps and the centre are used.
                 for area in polygons_of([elements.points[vertices]]):
                     areas.append(area)
                     scores.append(float(elements.confidence[index]))
@@ -262,7 +275,7 @@ class _Matches:
     Attributes:
         centres: Centre of each detection in metres. (2,)
         scores: Score of each detection, in [0, 1].
-        variances: Variance of each detection in square metres.
+        variances: Variance of each detection in square metres, the mean over its vertices.
     """
 
     centres: list[FloatArray] = field(default_factory=list)
@@ -300,12 +313,13 @@ def _views_of(
 
 
 def _shift_of(area: shapely.Polygon, matches: _Matches) -> Shift:
-    """Mean shift of the centres of detections from the centre of an area."""
+    """Mean shift of the centres of detections from the centre of an area, in metres."""
     centre = shapely.get_coordinates(area.centroid)[0]
     shifts = np.array(matches.centres) - centre  # (F, 2)
     variances = np.array(matches.variances)
     weights = np.array(matches.scores) / variances
     mean = weights @ shifts / weights.sum()  # (2,)
     direction = mean / max(float(np.linalg.norm(mean)), 1e-9)
-    # The distance of each shift is its component along the direction of the mean shift.
+    # The distance in each frame is the component of its shift along the mean shift. Components
+    # across it cancel in the mean.
     return Shift.of_frames(shifts @ direction, variances=variances, weights=weights)

@@ -9,17 +9,19 @@ from scipy.special import ndtr
 from drivemaps.drive import Drive
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
-REMOVED = "removed"
-ADDED = "added"
-MOVED = "moved"
+REMOVED = "removed"  # in the old map only
+ADDED = "added"  # in the new drives only
+MOVED = "moved"  # in both, at another position
 KINDS = (REMOVED, ADDED, MOVED)
 """Kinds of changes."""
 MIN_VIEWS = 5
 """A point is in view of a pass if at least this many frames of the pass have it in range."""
 _NEW_GROUND_M = 30.0  # ground farther than this from all elements of the old map is new
-_PRIOR_VIEWS = 2.0  # frames against a change that are assumed before any frame is counted
+# A view of an element is a frame that has the element in range. A share of views is computed as if
+# this many further views were against the change.
+_PRIOR_VIEWS = 2.0
 _MAP_SIGMA_M = 0.2  # standard deviation of the error of the old map, common to all frames
-_MIN_SIGMAS = 5.0  # a shift is significant from this number of standard errors
+_MIN_SIGMAS = 5.0  # a shift is significant if it is at least this many standard errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +46,10 @@ class Change:
         label: Index of the class.
         line: Vertices in metres in the global frame, closed for areas. A removed element has its
             position in the old map, and others have their new position. (n, 2)
-        confidence: Confidence in [0, 1].
+        confidence: Confidence that the change is real, in [0, 1].
         passes_in_view: Number of passes that have the element in view.
-        num_passes: Number of these passes that agree with the change: they do not detect a removed
-            element, or they detect an added or moved one.
+        num_passes: Number of the passes in view that agree with the change: they do not detect a
+            removed element, or they detect an added or moved one.
         moved_m: Distance in metres by which a moved element moved, across a line or between the
             centres of an area; None for other kinds.
         moved_std_m: Standard error of this distance in metres; None for other kinds.
@@ -70,9 +72,9 @@ class Changes:
     Args:
         changes: The changes, sorted by class and then by kind.
         num_on_new_ground: Number of elements of the passes on ground that the old map does not
-            cover, by class. They do not count as changes.
+            cover, by class name. They do not count as changes.
         num_not_in_view: Number of elements of the old map without a vertex in view of any pass, by
-            class.
+            class name.
     """
 
     changes: list[Change]
@@ -85,7 +87,7 @@ class Shift:
     """Mean distance between the new and the old position of an element.
 
     Args:
-        mean_m: Mean over the frames, weighted by score over variance, in metres.
+        mean_m: Weighted mean over the frames that detect the element, in metres.
         std_m: Standard error of the mean in metres: the larger one of two estimates, one from the
             variances of the frames, one from the scatter of their distances. Both estimates treat
             frames as independent.
@@ -103,12 +105,13 @@ class Shift:
         Args:
             distances: Distance in each frame, in metres. (F,)
             variances: Variance of each distance in square metres. (F,)
-            weights: Weight of each frame. (F,)
+            weights: Weight of each frame, such as its score over its variance. (F,)
         """
         shares = weights / weights.sum()
         mean_m = float(shares @ distances)
         # Variance of a weighted mean of independent values: sum of share^2 * variance.
         by_variances = float(shares**2 @ variances)
+        # Each squared deviation from the mean estimates the variance of its frame.
         by_scatter = float(shares**2 @ (distances - mean_m) ** 2)
         return cls(mean_m, std_m=max(by_variances, by_scatter) ** 0.5)
 
@@ -119,7 +122,8 @@ class Shift:
     def probability(self, smallest_m: float) -> float:
         """Probability that the shift exceeds ``smallest_m``.
 
-        The errors of the shift and of the old map are taken to be normally distributed.
+        The errors of the shift and of the old map are taken to be normally distributed. The error
+        of the old map is not part of ``std_m``, since it is common to all frames.
         """
         sigma = float(np.hypot(self.std_m, _MAP_SIGMA_M))
         return float(ndtr((abs(self.mean_m) - smallest_m) / sigma))
@@ -144,7 +148,7 @@ def views_of_passes(points: FloatArray, passes: list[Pass]) -> IntArray:
     """Count the frames of each pass that have points in range. (M, 2) -> (passes, M)"""
     if not len(points):
         return np.zeros((len(passes), 0), np.int64)
-    counts = []
+    counts = []  # for each pass, the number of frames that have each point in range. (M,) each
     for one_pass in passes:
         counts.append(one_pass.drive.count_frames_in_range(points))
     return np.stack(counts)
@@ -163,7 +167,7 @@ def near_lines(points: FloatArray, lines: list[FloatArray], within_m: float) -> 
     """
     shapes = []
     for line in lines:
-        if len(line) > 1:
+        if len(line) > 1:  # shapely makes no line of a single vertex
             shapes.append(shapely.LineString(line[:, :2]))
     is_near = np.zeros(len(points), dtype=np.bool_)
     if shapes and len(points):

@@ -17,8 +17,9 @@ from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
 
+# Names of coordinate frames in the file.
 _GLOBAL = "global"
-_FRAME = "vehicle"  # the annotation frame
+_FRAME = "vehicle"  # the annotation frame, which cameras and predictions refer to
 _GROUND = "base_footprint"  # x ahead, y left, on the road
 
 
@@ -39,8 +40,10 @@ def write_mcap(path: str | Path, replay: Replay) -> None:
         RuntimeError: If ``foxglove-sdk`` is missing.
     """
     foxglove = import_extra("foxglove", "viz")
+    # Only messages that are logged to this context are written to the file.
     log = _Log(foxglove.Context(), replay.colours)
     options = foxglove.mcap.MCAPWriteOptions(profile="gsmap")
+    # The contexts end in reverse order: the content is complete before the file gets its name.
     with (
         atomic_write(path, "wb") as file,
         foxglove.open_mcap(file, context=log.context, writer_options=options),
@@ -70,7 +73,7 @@ class _Log:
     def __init__(self, context: Any, colours: Sequence[str]) -> None:
         self.context = context
         self._messages = import_extra("foxglove.messages", "viz")
-        self._channel_kinds = import_extra("foxglove.channels", "viz")
+        self._channel_types = import_extra("foxglove.channels", "viz")
         self._channels: dict[str, Any] = {}
         self._colours = []
         for colour in colours:
@@ -80,7 +83,8 @@ class _Log:
     def _send(self, topic: str, message: Any, time_ns: int) -> None:
         """Log a message to the channel of its topic, which is created if needed."""
         if topic not in self._channels:
-            create_channel = getattr(self._channel_kinds, f"{type(message).__name__}Channel")
+            # A message of the type `SceneUpdate`, for example, needs a `SceneUpdateChannel`.
+            create_channel = getattr(self._channel_types, f"{type(message).__name__}Channel")
             self._channels[topic] = create_channel(topic, context=self.context)
         self._channels[topic].log(message, log_time=time_ns)
 
@@ -122,6 +126,7 @@ class _Log:
         name = camera.name
         frame_from_cam = invert_rigid(camera.cam_from_frame)
         self.transform(_FRAME, child=name, pose=frame_from_cam, time_ns=time_ns)
+        # Foxglove's projection matrix P is (3, 4). Its last column is zero without a stereo pair.
         projection = np.column_stack([camera.intrinsics, np.zeros(3)])
         calibration = messages.CameraCalibration(
             timestamp=self._stamp(time_ns),
@@ -133,10 +138,15 @@ class _Log:
         )
         self._send(f"/{name}/calibration", calibration, time_ns)
         if data_root is not None:
-            size_px = (camera.width, camera.height)
-            content, kind = image_content(data_root / camera.path, f"camera {name!r}", size_px)
+            size_px = (camera.width, camera.height)  # a file of another size is refused
+            path = data_root / camera.path
+            # The bytes of the checked file and their format, such as "jpeg".
+            content, image_format = image_content(path, f"camera {name!r}", size_px)
             image = messages.CompressedImage(
-                timestamp=self._stamp(time_ns), frame_id=name, data=content, format=kind
+                timestamp=self._stamp(time_ns),
+                frame_id=name,
+                data=content,
+                format=image_format,
             )
             self._send(f"/{name}/image", image, time_ns)
 
@@ -156,7 +166,9 @@ class _Log:
         for label, line in lines:
             points = [messages.Point3(x=x, y=y, z=z) for x, y, z in line.tolist()]
             primitive = messages.LinePrimitive(
-                thickness=0.15, points=points, color=self._colours[label]
+                thickness=0.15,  # metres
+                points=points,
+                color=self._colours[label],
             )
             primitives.append(primitive)
         self._send_entity(topic, frame, time_ns, lines=primitives)
@@ -168,6 +180,8 @@ class _Log:
             moment: Frame of the drive.
             time_ns: Time in nanoseconds.
         """
+        # `elements` are in the global frame. `moment.lines` are their vertices in the annotation
+        # frame, in the order of `elements`.
         elements = moment.frame.elements
         labels = elements.labels.tolist()
         lines = list(zip(labels, moment.lines, strict=True))
@@ -189,6 +203,7 @@ class _Log:
             )
             sphere = messages.SpherePrimitive(
                 pose=pose,
+                # Lengths of the whole axes in metres; nearly flat, so it appears as an ellipse.
                 size=messages.Vector3(x=2 * half_length, y=2 * half_width, z=0.02),
                 color=self._colours[label],
             )
@@ -201,8 +216,8 @@ class _Log:
         entity = messages.SceneEntity(
             timestamp=self._stamp(time_ns),
             frame_id=frame,
-            id=topic,
-            frame_locked=True,
+            id=topic,  # an entity replaces the previous one with this id
+            frame_locked=True,  # the shapes move with their frame until they are replaced
             **shapes,
         )
         self._send(topic, messages.SceneUpdate(entities=[entity]), time_ns)

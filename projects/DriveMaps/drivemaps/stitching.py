@@ -27,6 +27,7 @@ def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
     Returns:
         Joined lines; the last vertex of a ring equals its first. Each (m, D)
     """
+    # A ring also has two ends, at one place. They are not joined to other ends.
     is_closed = [bool(np.array_equal(line[0, :2], line[-1, :2])) for line in lines]
     # End that each joined end is joined to. Line i has the ends 2 * i (first) and 2 * i + 1 (last).
     partner_of: dict[int, int] = {}
@@ -34,9 +35,10 @@ def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
         first_line = first // 2
         second_line = second // 2
         if first in partner_of or second in partner_of:
-            continue
+            continue  # a better pair has joined one of the ends
         if is_closed[first_line] or is_closed[second_line]:
             continue
+        # Two ends of one line would close it to a ring.
         if first_line == second_line and arc_lengths(lines[first_line])[-1] < _RING_M:
             continue
         partner_of[first] = second
@@ -50,7 +52,10 @@ def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
 
 
 def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
-    """Pairs of ends that may be joined, the best pair first."""
+    """Pairs of numbers of ends that may be joined, the best pair first.
+
+    Line i has the ends 2 * i (first) and 2 * i + 1 (last).
+    """
     ends = []
     headings = []
     for line in lines:
@@ -59,7 +64,7 @@ def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
             inner = shapely.line_interpolate_point(shapely.LineString(from_end), _HEADING_M)
             heading = end - shapely.get_coordinates(inner)[0]
             ends.append(end)
-            headings.append(heading / max(np.linalg.norm(heading), 1e-9))
+            headings.append(heading / max(np.linalg.norm(heading), 1e-9))  # no division by 0
     if not ends:
         return []
     points = np.array(ends)  # (2 N, 2)
@@ -90,27 +95,30 @@ def _join_chain(
     Returns:
         Vertices without successive equal ones. (m, D)
     """
-    # Number of the end at which a line is entered. The number of its other end is `entry ^ 1`.
+    # Number of the end at which a line is entered. The ends of a line, 2 * i and 2 * i + 1, differ
+    # in the last bit. The number of the other end is therefore `entry ^ 1`.
     entry = 2 * index
     passed = {index}
-    # Walk from line to line until an end is not joined, or until all lines of a ring are passed.
+    # Walk back to the start of the chain: from line to line until an end is not joined, or until
+    # all lines of a ring are passed.
     while entry in partner_of and partner_of[entry] // 2 not in passed:
         entry = partner_of[entry] ^ 1
         passed.add(entry // 2)
     start = entry
-    parts = []
-    following: int | None = start
-    while following is not None:
-        entry = following
+    # Walk from the start to the other end, and collect the vertices of the lines.
+    pieces = []
+    next_entry: int | None = start
+    while next_entry is not None:
+        entry = next_entry
         visited.add(entry // 2)
         line = lines[entry // 2]
         starts_at_first = entry % 2 == 0
-        parts.append(line if starts_at_first else line[::-1])
-        following = partner_of.get(entry ^ 1)
-        if following == start:
-            first_vertex = parts[0][:1]
-            parts.append(first_vertex)  # closes the ring
+        pieces.append(line if starts_at_first else line[::-1])
+        next_entry = partner_of.get(entry ^ 1)
+        if next_entry == start:
+            first_vertex = pieces[0][:1]
+            pieces.append(first_vertex)  # closes the ring
             break
-    points = np.concatenate(parts)
+    points = np.concatenate(pieces)
     differs_from_previous = (points[1:, :2] != points[:-1, :2]).any(axis=1)
     return points[np.append(True, differs_from_previous)]  # the first vertex is kept

@@ -30,22 +30,24 @@ def true_map(drive: Drive) -> MapElements:
     Returns:
         Elements in the global frame, without scores.
     """
-    rows = []
+    rows = []  # label, vertices and score of each element
     for label, name in enumerate(drive.classes):
         pieces = []
         for frame in drive.frames:
+            # The elements of all frames are in the global frame, so they can be united directly.
             elements = frame.elements.select(frame.elements.labels == label)
             for line in elements.polylines:
                 if len(line) > 1:
                     pieces.append(line)
         unite = _unite_areas if name in AREA_CLASSES else _unite_lines
         for line in unite(pieces):
-            rows.append((label, line, 1.0))  # `drive_map` needs a score, and leaves it out below
+            rows.append((label, line, 1.0))  # `drive_map` takes rows with a score
+    # `drive_map` simplifies and sorts the elements. With `scored=False`, it drops the scores.
     return drive_map(rows, scored=False)
 
 
 def components(count: int, first: IntArray, second: IntArray) -> list[IntArray]:
-    """Group members that are connected by pairs.
+    """Group members that are connected by pairs, directly or through other members.
 
     Args:
         count: Number of members.
@@ -53,7 +55,8 @@ def components(count: int, first: IntArray, second: IntArray) -> list[IntArray]:
         second: Index of the other member of each pair. (pairs,)
 
     Returns:
-        Indices of the members of each group, ordered by their first members. each (n,)
+        Indices of the members of each group. A member without a pair is a group alone. The groups
+        are ordered by their first members. each (n,)
     """
     links = (np.ones(len(first)), (first, second))  # values, rows and columns of the graph
     graph = coo_array(links, shape=(count, count))
@@ -68,7 +71,8 @@ def polygons_of(rings: Sequence[FloatArray]) -> list[shapely.Geometry]:
         rings: Vertices of the rings in metres. each (n, 2)
 
     Returns:
-        Valid polygons or multipolygons.
+        Valid polygons or multipolygons. From a ring that runs back along itself, there may also be
+        a collection of polygons and lines.
     """
     areas = []
     for ring in rings:
@@ -83,14 +87,19 @@ def polygons_of(rings: Sequence[FloatArray]) -> list[shapely.Geometry]:
 def _unite_areas(rings: Sequence[FloatArray]) -> list[FloatArray]:
     """Outer rings of the union of areas. each (n, 2)"""
     parts = shapely.get_parts(shapely.union_all(polygons_of(rings), grid_size=GRID_M))
+    # Parts that are lines have no area, so they are left out, too.
     return [shapely.get_coordinates(p.exterior) for p in parts if p.area >= MIN_AREA_M2]
 
 
 def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
     """Unite the pieces that run along each other, and return the lines. each (n, 2)"""
     lines = np.array([shapely.LineString(piece) for piece in pieces], dtype=object)  # (N,)
-    # The length of a line inside of the strip around another line is their shared length.
+    # The length of a line inside of the strip around another line is their shared length. Copies of
+    # a line differ by much less than the grid, so twice the grid to each side is a safe width. Flat
+    # ends keep the strip from reaching beyond its line.
     strips = shapely.buffer(lines, 2 * GRID_M, cap_style="flat")
+    # Indices of lines, and of the strips that they intersect. A line is also paired with its strip,
+    # which does no harm.
     first, second = shapely.STRtree(strips).query(lines, predicate="intersects")
     shared_m = shapely.length(shapely.intersection(lines[first], strips[second]))
     overlap = shared_m > _OVERLAP_M
@@ -99,6 +108,8 @@ def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
         union = shapely.union_all(lines[group], grid_size=GRID_M)
         united.append(shapely.line_merge(union))
     parts = shapely.get_parts(np.array(united, dtype=object))
+    # `line_merge` has joined lines at points where exactly two of them end. `stitch` also joins
+    # lines of different groups, across gaps of up to 2 m, and straight on at forks.
     stitched = stitch([shapely.get_coordinates(part) for part in parts])
     # Short lines are dropped only now, as a part between two forks may be short before stitching.
     return [line for line in stitched if shapely.LineString(line).length >= MIN_LENGTH_M]

@@ -12,7 +12,7 @@ from gsmap.utils.shipped import shipped_path
 
 
 def _summary(tool: Path) -> str:
-    """Return the first line of the docstring of a script without running the script."""
+    """Return the summary of a script, from its docstring, without running the script."""
     source = tool.read_text(encoding="utf-8")
     docstring = ast.get_docstring(ast.parse(source)) or ""
     first_line = docstring.split("\n")[0]
@@ -32,6 +32,7 @@ def _overview(tools: dict[str, Path]) -> str:
 
 def main() -> None:
     """Run the script named by the first argument, like ``python tools/NAME.py``."""
+    # `shipped_path` finds the folder in the repository, or in the files of an installed package.
     scripts = sorted(shipped_path("tools").glob("*.py"))
     tools = {path.stem: path for path in scripts}
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
@@ -40,15 +41,19 @@ def main() -> None:
     elif name == "--version":
         sys.stdout.write(f"gsmap {__version__}\n")
     elif name not in tools:
+        # The text "; did you mean ...?" with a similar command. It is empty if none is similar.
         hint = suggestion(name, tools) or f"; there are {', '.join(tools)}."
         sys.stderr.write(f"error: there is no command {name}{hint}\n")
         sys.exit(BAD_INPUT)
     else:
+        # The `CommandParser` of the script shows this name in its usage and messages.
         CommandParser.program = f"gsmap {name}"
-        # Drop ``gsmap``, and replace the name of the command by the path of its script.
+        # The script must find its path in `sys.argv[0]`, followed by its arguments. So drop the
+        # path of ``gsmap``, and replace the name of the command by the path of its script.
         del sys.argv[0]
         sys.argv[0] = str(tools[name])
-        sys.path.insert(0, str(tools[name].parent))  # as Python does for a script
+        # For a script, Python looks for modules in its folder. `run_path` does not add the folder.
+        sys.path.insert(0, str(tools[name].parent))
         runpy.run_path(sys.argv[0], run_name="__main__")
 
 

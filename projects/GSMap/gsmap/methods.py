@@ -42,7 +42,8 @@ class Method:
             - ``overview``: Row of the method in ``docs/methods.md``, which
               ``python docs/method_tables.py`` writes.
             - ``parameters``: Number of trainable parameters of each config.
-            - ``settings``: Published values by config and path of the setting.
+            - ``settings``: Published values, by config and then by the dotted path of the setting
+              in the config.
             - ``heads``: Published parts of each config's head: the number of queries of each
               group, the weights of the losses and auxiliary heads by name, and the weights of the
               matching costs in the order of the config.
@@ -58,6 +59,8 @@ class Method:
         return read_json(self.folder / "paper.json")
 
 
+# Arguments: name, title, and the other methods that this one builds on. The documentation lists the
+# methods in this order.
 METHODS = (
     Method("gsmap", "GSMap", built_on=("maptr",)),
     Method("maptr", "MapTR"),

@@ -6,6 +6,8 @@ from pkgutil import iter_modules
 from gsmap.methods import METHODS
 from gsmap.utils.collection import pause_collection
 
+# Modules with registered classes outside of FOLDERS. A decorator registers each class when its
+# module is imported.
 MODULES = (
     "gsmap.apis.rig_fit",
     "gsmap.datasets.stream_samplers",
@@ -24,7 +26,7 @@ MODULES = (
     "gsmap.visualization.map_visualization_hook",
     "gsmap.visualization.map_visualizer",
 )
-FOLDERS = (  # all modules of these folders are imported
+FOLDERS = (  # all modules directly in these folders are imported, without subfolders
     "gsmap.datasets.transforms",
     "gsmap.models.encoders",
     "gsmap.models.base",

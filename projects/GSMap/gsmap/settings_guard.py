@@ -29,11 +29,14 @@ _LIBRARIES = "LD_LIBRARY_PATH"
 
 @contextmanager
 def _without_relative_files(module: ModuleType) -> Iterator[None]:
-    """Hide all files with relative paths from ``os.path.exists`` during the import of a module."""
+    """Hide all files with relative paths from ``os.path.exists`` during the import of a module.
+
+    matplotlib and numba test with this function whether the working folder has a settings file.
+    """
     exists = os.path.exists
 
     def absolute_path_exists(path: Any) -> bool:
-        # An integer is a file descriptor.
+        # An integer is a file descriptor, not a path.
         is_relative = not isinstance(path, int) and not os.path.isabs(path)
         return not is_relative and exists(path)
 
@@ -42,7 +45,8 @@ def _without_relative_files(module: ModuleType) -> Iterator[None]:
         yield
     finally:
         os.path.exists = exists
-    if "_config_fname" in vars(module):  # settings of numba, which are read again later
+    # Relative name of numba's settings file, which numba reads again when it compiles.
+    if "_config_fname" in vars(module):
         vars(module)["_config_fname"] = os.devnull
 
 
@@ -58,6 +62,7 @@ def _with_unchanged_library_path(_: ModuleType) -> Iterator[None]:
             os.environ[_LIBRARIES] = library_path
 
 
+# Modules of scikit-learn that mmdet imports, and their parent packages.
 _SKLEARN = (
     "sklearn",
     "sklearn.gaussian_process",
@@ -70,7 +75,7 @@ class _DeferredModule(ModuleType):
     """Placeholder of a module. It imports the module when one of its functions is called."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        if name.startswith("__"):
+        if name.startswith("__"):  # Python itself looks for attributes such as ``__path__``
             raise AttributeError(name)
 
         def call(*args: Any, **options: Any) -> Any:
@@ -84,18 +89,20 @@ class _DeferredModule(ModuleType):
 @contextmanager
 def _with_deferred_sklearn(_: ModuleType) -> Iterator[None]:
     """Replace scikit-learn by placeholders during the import of a module that uses it."""
-    if _SKLEARN[0] in sys.modules:
+    if _SKLEARN[0] in sys.modules:  # scikit-learn is imported already
         yield
         return
     placeholders = {name: _DeferredModule(name) for name in _SKLEARN}
     for name, placeholder in placeholders.items():
         if "." in name:
+            # A module is also an attribute of its parent package.
             parent, child = name.rsplit(".", maxsplit=1)
             setattr(placeholders[parent], child, placeholder)
     sys.modules.update(placeholders)
     try:
         yield
     finally:
+        # A later import, also by a placeholder, finds the modules of scikit-learn.
         for name in placeholders:
             del sys.modules[name]
 
@@ -129,7 +136,8 @@ class SettingsGuard:
             target: Module to reload, or None.
 
         Returns:
-            Specification with a guarded loader, or None for all other modules.
+            Specification with a guarded loader. None for all other modules, so that Python asks the
+            next finder, and for a module that is not installed.
         """
         if name not in _GUARDS:
             return None
@@ -140,7 +148,10 @@ class SettingsGuard:
 
 
 class _GuardedLoader(Loader):
-    """Loader that runs a module under a guard and then restores the original loader."""
+    """Loader that runs a module under a guard, in place of its original loader.
+
+    Before it runs the module, it restores the original loader in the attributes of the module.
+    """
 
     def __init__(self, loader: Loader, guard: _Guard) -> None:
         self._loader = loader
@@ -152,6 +163,7 @@ class _GuardedLoader(Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         """Run the code of the module under the guard."""
+        # Other code may read these attributes, for example to find files of the package.
         module.__loader__ = self._loader
         if module.__spec__ is not None:
             module.__spec__.loader = self._loader

@@ -1,4 +1,9 @@
-"""Transforms and odometry of a bag: the mounting of the cameras, and the poses of the vehicle."""
+"""Transforms and odometry of a bag: the mounting of the cameras, and the poses of the vehicle.
+
+The pose of a frame is its transform to another frame. Each frame of a bag has a parent, the frame
+above it, up to a root such as the map. A transform is static if it is valid for the whole
+recording.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,11 +15,15 @@ from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.errors import InputError
 from mapdata.folders.rig import PoseTrack
 
-VEHICLE_FRAMES = ("base_footprint", "base_link")
+VEHICLE_FRAMES = ("base_footprint", "base_link")  # usual names of the vehicle's frame
 _GAP_NS = 10**9  # longest gap between two poses in which the pose is interpolated
-_FOREVER_NS = 10**20  # gap of a static transform, longer than any recording
+# Gap for the track of a static transform. Its single pose is used up to a tenth of the gap before
+# and after its time, which is longer than any recording.
+_FOREVER_NS = 10**20
 _SELDOM_NS = 500_000_000  # transforms with a longer mean interval are valid until the next one
-_STILL_M = 1e-3  # smaller changes of a pose do not count as a motion
+# Smaller changes do not count as a motion. The bound holds for each entry of a pose, metres and
+# entries of the rotation alike.
+_STILL_M = 1e-3
 _STILL_JUMP_M = 0.1  # smaller distances of successive poses do not count as jumps
 # Ranks of odometry by the frame whose poses it contains; the lowest rank is preferred.
 _OF_VEHICLE = 0
@@ -38,7 +47,7 @@ class Transforms:
         is_static: Whether the topic is static, so that the first message is always valid.
         times_ns: Times of the transforms, in the order of the bag; one time if static. (n,)
         poses: Transforms from the child to the parent, in metres. (4, 4) each
-        count: Number of messages.
+        count: Number of messages, which exceeds the number of poses if the topic is static.
         num_changes: Number of later messages of a static topic that differ from the first one.
     """
 
@@ -54,6 +63,7 @@ class Transforms:
     def add(self, time_ns: int, pose: np.ndarray) -> None:
         """Add the transform of a message."""
         self.count += 1
+        # A static topic may repeat its message. Only the first one is stored.
         if not self.is_static or not self.times_ns:
             self.times_ns.append(time_ns)
             self.poses.append(pose)
@@ -62,14 +72,14 @@ class Transforms:
 
     @cached_property
     def moves(self) -> bool:
-        """Whether a pose differs from the first one by more than a millimetre.
+        """Whether an entry of a pose differs from the first pose by more than `_STILL_M`.
 
         The value is cached, so it must only be read after all transforms are added.
         """
         return bool(np.abs(np.array(self.poses) - self.poses[0]).max() > _STILL_M)
 
     def __str__(self) -> str:
-        """Return parent and topic, for notes such as "the transforms from 'base_link' to ..."."""
+        """Return the parent, the number of messages and the topic, for notes."""
         return f"{self.parent!r} ({self.count} messages on {self.topic})"
 
 
@@ -92,6 +102,7 @@ class Odometry:
     poses: list[np.ndarray] = field(default_factory=list)
 
     def __str__(self) -> str:
+        """Return the topic, the number of poses and both frames, for notes."""
         return f"{self.topic} ({len(self.poses)} poses of {self.child!r} in {self.parent!r})"
 
 
@@ -99,7 +110,8 @@ class PoseChain:
     """Pose of the ground below a vehicle as a function of time, from a chain of transforms.
 
     Args:
-        steps: Pose tracks from the vehicle's frame up to the root of the frame tree.
+        steps: Poses of each frame in its parent over time, from the vehicle's frame upwards to the
+            root of the frame tree.
         ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
         span_ns: First and last time at which all tracks have a pose.
     """
@@ -126,13 +138,17 @@ class PoseChain:
 class FrameTree:
     """Tree of the frames of a bag, in which each frame has one parent.
 
-    If a frame has several parents, or transforms on several topics, the source is preferred whose
-    parent leads to the vehicle, then the source with the most messages, then the first topic by
-    name.
+    The messages of a bag may give a frame several parents, or transforms on several topics. Each
+    pair of topic and parent is a source of transforms, of which one is chosen for each frame. The
+    source is preferred whose parent leads to the vehicle, then the source with the most messages,
+    then the first topic by name.
+
+    `choose_vehicle` makes the choice. It must be called after all messages are added, and before
+    `chain`, `between` and `poses`.
 
     Args:
-        edges: Transforms of each frame, by the topic and the parent.
-        notes: Notes on transforms that are not used.
+        edges: Sources of transforms of each frame, by the topic and the parent.
+        notes: Notes on transforms that are not used, or not used in full.
     """
 
     edges: dict[str, dict[tuple[str, str], Transforms]] = field(default_factory=dict)
@@ -159,7 +175,7 @@ class FrameTree:
 
     @property
     def frames(self) -> set[str]:
-        """Names of all frames."""
+        """Names of all frames, roots included."""
         names = set(self.edges)
         for sources in self.edges.values():
             names.update(parent for _, parent in sources)
@@ -177,7 +193,7 @@ class FrameTree:
             Name of the vehicle's frame.
 
         Raises:
-            ValueError: If the bag has no such frame.
+            ValueError: If the bag has no such frame, or if the transforms above it form a circle.
         """
         candidates = VEHICLE_FRAMES if wanted is None else (wanted,)
         known_names = [name for name in candidates if name in self.frames]
@@ -188,6 +204,7 @@ class FrameTree:
                 "--vehicle-frame, or give --calibration calibration.yaml; there are "
                 f"{sorted(self.frames) or 'no transforms at all'}"
             )
+        # The choice of the parents depends on the vehicle, so it is made for each candidate.
         for name in known_names:
             self._choose_parents(name)
             lower_frames = self.chain(name)[:-1]  # the root has no transform to a parent
@@ -205,13 +222,19 @@ class FrameTree:
         return name
 
     def _choose_parents(self, vehicle: str) -> None:
-        """Choose one parent for each frame, and note the transforms that are not used."""
+        """Choose one source of transforms for each frame, and note the others.
+
+        An earlier choice and its notes are dropped.
+        """
         self._chosen.clear()
         self.notes.clear()
 
         def rank(edge: Transforms) -> tuple[bool, int, str]:
             """Sort key of a source of transforms; the smallest key is the best."""
+            # Frames such as cameras lie below the vehicle, so their parents lead to it. The parents
+            # of the vehicle do not count.
             leads_to_vehicle = edge.child != vehicle and self._leads(edge.parent, vehicle)
+            # False precedes True, and the largest count has the smallest negative.
             return not leads_to_vehicle, -edge.count, edge.topic
 
         for child, sources in self.edges.items():
@@ -230,14 +253,17 @@ class FrameTree:
                 )
 
     def _leads(self, frame: str, vehicle: str) -> bool:
-        """Whether a frame is the vehicle's, or a path of parents leads from it to the vehicle."""
+        """Whether a frame is the vehicle's, or a path of parents leads from it to the vehicle.
+
+        All sources are followed, because parents are not chosen yet.
+        """
         visited = set()
         pending = [frame]
         while pending:
             name = pending.pop()
             if name == vehicle:
                 return True
-            if name not in visited:
+            if name not in visited:  # the transforms may form a circle
                 visited.add(name)
                 pending += [parent for _, parent in self.edges.get(name, ())]
         return False
@@ -260,9 +286,17 @@ class FrameTree:
         """Return the pose of a frame in the vehicle's frame; None if not connected. (4, 4)
 
         If a transform between the two moves, its first pose is used, with a note in ``notes``.
+
+        Args:
+            vehicle: Name of the vehicle's frame, or of another frame to which the pose refers.
+            frame: Name of the frame.
+
+        Raises:
+            ValueError: If the transforms form a circle.
         """
         frame_chain = self.chain(frame)
         vehicle_chain = self.chain(vehicle)
+        # Both chains end at a root. Their lowest common frame connects the two.
         common = next((name for name in frame_chain if name in vehicle_chain), None)
         if common is None:
             return None
@@ -301,7 +335,11 @@ class FrameTree:
             ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
 
         Returns:
-            The poses; None if all transforms are static, or if poses jump back and forth.
+            The poses; None if all transforms are static, or if poses jump back and forth. Jumps are
+            noted in ``notes``.
+
+        Raises:
+            ValueError: If the transforms form a circle, or a pose is not finite.
         """
         lower_frames = self.chain(vehicle)[:-1]  # the root has no transform to a parent
         edges = [self._chosen[name] for name in lower_frames]
@@ -313,7 +351,7 @@ class FrameTree:
         lowest = moving_edges[0]
         start_ns = min(lowest.times_ns)
         end_ns = max(lowest.times_ns)
-        drive_ns = end_ns - start_ns
+        drive_ns = end_ns - start_ns  # duration
         steps = []
         jumps: list[str] = []
         for edge in edges:
@@ -325,6 +363,7 @@ class FrameTree:
             count = len(edge.times_ns)
             is_seldom = count == 1 or count * _SELDOM_NS < drive_ns
             holds = edge is not lowest and is_seldom
+            # A pose that holds is valid after its time, but not before it.
             start_ns = max(start_ns, min(edge.times_ns))
             if not holds:
                 end_ns = min(end_ns, max(edge.times_ns))
@@ -338,13 +377,21 @@ class FrameTree:
 
 
 def _jump_notes(track: PoseTrack, source: str) -> list[str]:
-    """Return a note if poses alternate between two places, as if two publishers sent them."""
-    places = track.poses[:, :3, 3]
-    if len(places) < 5:
+    """Return a list with one note if poses alternate between two places, otherwise an empty list.
+
+    Such poses are not usable: two publishers seem to send different poses of one frame.
+
+    Args:
+        track: Poses over time.
+        source: Description of the poses, for the note.
+    """
+    positions = track.poses[:, :3, 3]  # in metres, in the order of time (n, 3)
+    if len(positions) < 5:  # too few to recognise a pattern
         return []
-    # If places alternate, the next place is far away, and the place after it is near again.
-    to_next = float(np.median(np.linalg.norm(places[1:] - places[:-1], axis=1)))
-    to_second = float(np.median(np.linalg.norm(places[2:] - places[:-2], axis=1)))
+    # If places alternate, the next place is far away, and the place after it is near again. In a
+    # steady motion, the place after it is twice as far away.
+    to_next = float(np.median(np.linalg.norm(positions[1:] - positions[:-1], axis=1)))
+    to_second = float(np.median(np.linalg.norm(positions[2:] - positions[:-2], axis=1)))
     if to_next < 2 * to_second + _STILL_JUMP_M:
         return []
     return [
@@ -369,7 +416,11 @@ def odometry_poses(
         ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
 
     Returns:
-        The poses (None without usable odometry), and notes on assumptions.
+        The poses (None without usable odometry, or if its poses jump back and forth), and notes on
+        assumptions and on odometry that is not used.
+
+    Raises:
+        ValueError: If the transforms form a circle, or a pose is not finite.
     """
     # Rank (0 is the best), index in ``odometries``, and transform from the vehicle's frame to the
     # frame of the odometry's body.
@@ -380,6 +431,7 @@ def odometry_poses(
         if child == vehicle:
             candidates.append((_OF_VEHICLE, number, np.eye(4)))
             continue
+        # An unknown body is assumed to be the vehicle.
         if not child or not vehicle:
             candidates.append((_OF_UNKNOWN_FRAME, number, np.eye(4)))
             continue
@@ -404,6 +456,7 @@ def odometry_poses(
     best = odometries[number]
     if rank == _OF_UNKNOWN_FRAME and best.child not in VEHICLE_FRAMES:
         notes.append(f"{best} is taken for the poses of the vehicle's frame")
+    # `number` is the index of the best candidate, so the others have another index.
     others = [str(odometries[other]) for _, other, _ in candidates if other != number]
     if others:
         notes.append(f"of several odometries {best} is used, and {' and '.join(others)} is not")
@@ -412,4 +465,5 @@ def odometry_poses(
     if jumps:
         return None, notes + jumps
     span_ns = (min(best.times_ns), max(best.times_ns))
+    # The track has the poses of the odometry's body, so the ground is given in the body's frame.
     return PoseChain([track], ground=child_from_vehicle @ ground, span_ns=span_ns), notes

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 
 from gsmap.utils.errors import InputError
 
+# Message types of images, the preferred one first.
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
-INFO = "sensor_msgs/msg/CameraInfo"
+INFO = "sensor_msgs/msg/CameraInfo"  # message type of the calibration of a camera
 # Last parts of a topic of images that do not name a camera.
 _GENERIC_ENDINGS = (
     "compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
@@ -85,6 +86,9 @@ def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
     A camera is named by the last part of its topic that is not generic (such as ``image_raw``), or
     by all parts up to it if names would repeat.
 
+    Args:
+        kinds: Message type of each topic of the bag.
+
     Raises:
         ValueError: If two cameras would get one name.
     """
@@ -92,11 +96,13 @@ def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
     for image_kind in IMAGES:
         for topic in sorted(kinds):
             parts = topic.split("/")
+            # Depth images have the message type of compressed images, but show no colours.
             if kinds[topic] != image_kind or parts[-1] == "compressedDepth":
                 continue
+            # The first part is empty, since a topic starts with "/". One other part is kept.
             while len(parts) > 2 and parts[-1] in _GENERIC_ENDINGS:
                 parts.pop()
-            topic_of.setdefault("/".join(parts), topic)
+            topic_of.setdefault("/".join(parts), topic)  # keeps the compressed images, found first
     names = [base.rsplit("/", maxsplit=1)[-1] for base in topic_of]
     if len(set(names)) < len(names):
         names = [base.strip("/").replace("/", "_") for base in topic_of]
@@ -113,15 +119,15 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
         listing: Topics of the bag as text, for error messages.
 
     Returns:
-        Topics of the images and of the camera info, by camera. Images without camera info are left
-        out.
+        Topic of the images and topic of the camera info of each camera, by its name. Images without
+        camera info are left out.
 
     Raises:
         ValueError: If there is no camera, or the camera info of a camera is ambiguous.
     """
     infos = sorted(topic for topic, kind in kinds.items() if kind == INFO)
-    candidates = {}
-    kinds_with_info = {}
+    candidates = {}  # topics of camera info that may belong to each topic
+    kinds_with_info = {}  # message types of the topics that have candidates
     for topic, kind in kinds.items():
         candidates[topic] = _candidate_infos(topic, infos=infos)
         if candidates[topic]:
@@ -169,7 +175,7 @@ def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:
     These are the topics of camera info in the nearest namespace above the images. If some of them
     contain the distinguishing words of the images' topic (`_words`), only these are returned.
     """
-    nearest = None
+    nearest = None  # longest namespace of a camera info that contains the images
     for info in infos:
         namespace = info.rsplit("/", maxsplit=1)[0]
         is_above = topic.startswith(f"{namespace}/")

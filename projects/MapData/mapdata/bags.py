@@ -1,4 +1,8 @@
-"""Samples of a bag: images, camera info, transforms and poses of ROS 1, ROS 2 or Foxglove."""
+"""Samples of a bag: images, camera info, transforms and poses of ROS 1, ROS 2 or Foxglove.
+
+A topic is a named stream of messages in a bag. Camera info is a message with the intrinsics and the
+distortion of a camera. The rig is the set of the cameras on the vehicle.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,7 +34,7 @@ from mapdata.ros_bag import library_errors
 
 _TOLERANCE_NS = 50_000_000  # largest difference in time of the images of one sample
 _REACH_NS = 100_000_000  # images up to this time before the first or after the last pose are used
-_CHOOSE = "choose cameras with --topics"
+_CHOOSE = "choose cameras with --topics"  # end of a note on a camera that is left out
 
 
 def read_bag(path: Path, options: InputOptions) -> Source:
@@ -61,6 +65,8 @@ def read_bag(path: Path, options: InputOptions) -> Source:
             finally:
                 bag.close()
         except ValueError as error:
+            # Damage of the files can cause any other error. If there is damage, it is reported
+            # instead, with a remedy.
             damage = damage_in(path)
             if damage is None:
                 raise
@@ -74,14 +80,18 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     are grouped into frames at the times of one camera, and the frames with a pose become samples.
     Finally, the images of these frames are written.
     """
+    # Message type of each topic. A connection is the part of a topic that one publisher has
+    # written.
     kinds = {connection.topic: connection.msgtype for connection in bag.connections}
     listing = _listing(bag)
     calibration = options.calibration
     notes = list(bag.notes)
-    # This is the pose of the ground below the vehicle, in the vehicle's frame. (4, 4)
+    # Pose of the ground below the vehicle, in the vehicle's frame. (4, 4)
     ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
     check_topics(kinds, options.topics, listing=listing, needs_info=calibration is None)
-    # `topics` below has the topic of the images and the topic of the camera info of each camera.
+    # `topics` has the topic of the images and the topic of the camera info of each camera, by its
+    # name. `content` has all messages of the bag except the images: camera info, the tree of
+    # frames, odometry, and the times of the images. `rig` has the cameras by their image topic.
     if calibration is None:
         topics = options.topics or camera_topics(kinds, listing)
         content = read_content(bag, topics)
@@ -94,41 +104,48 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         calibrated_cameras, ground = read_rig(calibration, ground)
         topics = _topics_of(calibrated_cameras, options=options, kinds=kinds)
         content = read_content(bag, topics)
-        for name, pair in topics.items():
-            _require_messages(name, pair, content=content)
+        for name, camera_topic_pair in topics.items():
+            _require_messages(name, camera_topic_pair, content=content)
+        # Without transforms, poses can only come from odometry, and the vehicle has no frame.
         has_frames = bool(content.tree.frames)
         vehicle = _choose_vehicle(content, wanted=options.vehicle_frame) if has_frames else ""
-        rig = {}  # cameras by the topic of their images
+        rig = {}
         for camera, _ in calibrated_cameras:
             topic, _ = topics[camera.name]
             rig[topic] = camera
         content.digest.update(calibration.read_bytes())
+    # If a model was trained on cameras of these names, distorted images are rectified to the
+    # cameras of the model. The key describes these cameras.
     rectification_key = set_rectification_targets(list(rig.values()), options.trained)
     content.digest.update(rectification_key)
 
     times_ns = {}  # distinct times of the images, ascending, by camera
     for topic, camera in rig.items():
         times_ns[camera.name] = np.unique(content.images[topic].times_ns)
-    first = _sampling_camera(list(times_ns))
+    sampling_camera = _sampling_camera(list(times_ns))
+    sampling_times_ns = times_ns[sampling_camera]
     pose_at, pose_notes = _poses(content, vehicle=vehicle, ground=ground)
-    requested_count = len(thin_out(times_ns[first], options.rate_hz))
-    times_with_pose = _near_poses(times_ns[first], pose_at)
+    # `thin_out` selects times at the requested rate. The times are limited to the poses first, so
+    # that the selection starts with the first time that has a pose.
+    requested_count = len(thin_out(sampling_times_ns, options.rate_hz))
+    times_with_pose = _near_poses(sampling_times_ns, pose_at)
     wanted_ns = thin_out(times_with_pose, options.rate_hz).tolist()
     frames = _group_images(times_ns, wanted_ns, scene=path.stem)
+    # Frames without a pose are left out, unless the bag has no poses at all.
     samples = rig_samples(path.stem, list(rig.values()), frames=frames, pose_at=pose_at)
 
     notes += content.notes() + content.tree.notes + pose_notes
     notes += _usage_notes(
         len(samples),
         requested_count,
-        times_ns=times_ns[first],
+        times_ns=sampling_times_ns,
         pose_at=pose_at,
-        camera=first,
+        camera=sampling_camera,
     )
-    notes += _absence_notes(frames, times_ns, first=first)
+    notes += _absence_notes(frames, times_ns, sampling_camera=sampling_camera)
     # The folder of the images depends on the content of the bag and on the rectification.
     digest = content.digest.hexdigest()[:16]
-    root = options.frames_dir / f"{file_name(path.stem)}-{digest}"
+    root = options.frames_dir / f"{file_name(path.stem)}-{digest}"  # `file_name` makes names safe
     sample_times_ns = {sample.timestamp_ns for sample in samples}
     sample_frames = [frame for frame in frames if frame.time_ns in sample_times_ns]
     notes += _write_images(bag, rig, frames=sample_frames, frames_dir=root)
@@ -161,6 +178,10 @@ def _group_images(
         times_ns: Times of the images, ascending, by camera. (n,) each
         wanted_ns: Times of the frames. (m,)
         scene: Name of the scene, with which the tokens of the frames begin.
+
+    Returns:
+        The frames. A camera without an image within 50 ms is missing in a frame. The paths of the
+        images are relative to the folder of the images.
     """
     frames = []
     nearest = nearest_images(times_ns, wanted_ns, tolerance_ns=_TOLERANCE_NS)
@@ -183,6 +204,9 @@ def _topics_of(
         calibrated_cameras: Cameras of the calibration file, with their setting ``images``.
         options: Options with the topics that the user has given.
         kinds: Type of the messages, by topic.
+
+    Returns:
+        Pairs (topic of the images, "") by the name of the camera.
     """
     images = {name: topic for name, (topic, _) in options.topics.items()}
     if not images:
@@ -202,7 +226,7 @@ def _topic_of(
     Args:
         name: Name of the camera.
         images_setting: Setting ``images`` of the camera in the calibration file. It may be a topic.
-        images: Topics of images, by camera.
+        images: Topics of images, by the name of the camera.
         kinds: Type of the messages, by topic.
     """
     topic = images_setting if images_setting in kinds else images.get(name)
@@ -236,10 +260,13 @@ def _choose_vehicle(content: BagContent, wanted: str | None) -> str:
 
 
 def _require_messages(name: str, topics: tuple[str, str], content: BagContent) -> None:
-    """Raise a ``ValueError`` if a camera has no images, or lacks its camera info."""
+    """Raise a ``ValueError`` if a camera has no images, or lacks its camera info.
+
+    ``topics`` are the topics of its images and of its camera info; the second may be empty.
+    """
     topic, info = topics
     has_images = bool(content.images[topic].times_ns)
-    lacks_info = bool(info) and topic not in content.infos
+    lacks_info = bool(info) and topic not in content.infos  # by the topic of the images
     if not has_images or lacks_info:
         raise InputError(
             f"camera {name!r} has no message on {topic} or {info or 'its info'}: choose others "
@@ -262,15 +289,16 @@ def _build_rig(
     rig = {}
     notes = []
     errors: dict[str, ValueError] = {}
+    # `trouble` is the reason why the images of a topic cannot be used; empty if they can.
     is_any_usable = any(not content.images[topic].trouble for topic, _ in topics.values())
-    for name, pair in topics.items():
-        topic = pair[0]
+    for name, camera_topic_pair in topics.items():
+        topic = camera_topic_pair[0]
         trouble = content.images[topic].trouble
         try:
             if trouble and is_any_usable and not by_hand:
                 raise InputError(f"camera {name!r}: {trouble}")
             rig[topic], camera_notes = _build_camera(
-                name, pair, content=content, vehicle=vehicle, ground=ground
+                name, camera_topic_pair, content=content, vehicle=vehicle, ground=ground
             )
             notes += camera_notes
         except ValueError as error:
@@ -290,6 +318,7 @@ def _build_camera(
     _require_messages(name, topics, content=content)
     images = content.images[topics[0]]
     info = content.infos[topics[0]]
+    # Frames of ROS 1 may have a leading slash, which the transforms of `content` do not have.
     frame = images.frame_id or info.header.frame_id.lstrip("/")
     vehicle_from_cam = content.tree.between(vehicle, frame)
     if vehicle_from_cam is None:
@@ -305,7 +334,11 @@ def _build_camera(
 def _poses(
     content: BagContent, vehicle: str, ground: np.ndarray
 ) -> tuple[PoseChain | None, list[str]]:
-    """Poses of the ground from the transforms of the vehicle's frame, or else from odometry."""
+    """Poses of the ground from the transforms of the vehicle's frame, or else from odometry.
+
+    ``vehicle`` is empty if the bag has no transforms. The poses are None if there are none. They
+    come with notes on assumptions.
+    """
     chain = content.tree.poses(vehicle, ground) if vehicle else None
     if chain is not None:
         return chain, []
@@ -314,9 +347,9 @@ def _poses(
 
 
 def _near_poses(times_ns: np.ndarray, pose_at: PoseChain | None) -> np.ndarray:
-    """Select the times within the span of the poses. (n,) -> (m,)
+    """Select the times within the span of the poses, or up to 0.1 s outside of it. (n,) -> (m,)
 
-    All times are returned if no time is within the span, or if there are no poses.
+    All times are returned if no time is selected, or if there are no poses.
     """
     if pose_at is None:
         return times_ns
@@ -334,7 +367,12 @@ def _usage_notes(
 ) -> list[str]:
     """Note on requested samples without a pose; a ``ValueError`` if no sample has a pose.
 
-    ``times_ns`` are the times of the images of ``camera``, which define the samples. (n,)
+    Args:
+        count: Number of samples with a pose.
+        requested_count: Number of samples at the requested rate, with or without a pose.
+        times_ns: Times of the images of ``camera``, which define the samples. (n,)
+        pose_at: Poses, or None.
+        camera: Name of the camera.
     """
     if pose_at is None or count >= requested_count:
         return []
@@ -352,9 +390,12 @@ def _usage_notes(
 
 
 def _absence_notes(
-    frames: Sequence[RigFrame], times_ns: Mapping[str, np.ndarray], first: str
+    frames: Sequence[RigFrame], times_ns: Mapping[str, np.ndarray], sampling_camera: str
 ) -> list[str]:
-    """Notes on cameras that lack an image at some samples; ``first`` defines the samples."""
+    """Notes on cameras that lack an image in some frames.
+
+    The images of ``sampling_camera`` define the times of the frames.
+    """
     notes = []
     for name, image_times in times_ns.items():
         count = sum(name not in frame.images for frame in frames)
@@ -363,8 +404,8 @@ def _absence_notes(
         note = f"camera {name!r} has no image within 50 ms at {count} of {len(frames)} samples"
         if count == len(frames):
             note += (
-                f": its images are from {_span_text(image_times)}, and the images of {first!r} "
-                f"are from {_span_text(times_ns[first])}"
+                f": its images are from {_span_text(image_times)}, and the images of "
+                f"{sampling_camera!r} are from {_span_text(times_ns[sampling_camera])}"
             )
         notes.append(note)
     return notes
@@ -379,7 +420,7 @@ def _write_images(
     bag: Bag, rig: Mapping[str, RigCamera], frames: Sequence[RigFrame], frames_dir: Path
 ) -> list[str]:
     """Write the missing image files of frames, with notes on unusable images."""
-    missing = {}
+    missing = {}  # files to write, by the name of the camera and the time of the image
     for frame in frames:
         for name, (path, time_ns) in frame.images.items():
             if not (frames_dir / path).is_file():
@@ -388,16 +429,19 @@ def _write_images(
         return []
     connections = [connection for connection in bag.connections if connection.topic in rig]
     notes = []
+    # Each item has the connection, the time of recording in nanoseconds, and the bytes of a
+    # message.
     for connection, recorded_ns, raw in read_messages(bag, connections):
         camera = rig[connection.topic]
         try:
-            with library_errors():
+            with library_errors():  # converts errors of the library to ValueError
                 message = bag.parser(connection)(raw)
+                # A stamp of 0 means that the publisher set none.
                 time_ns = stamp_ns(message.header) or recorded_ns
                 target = missing.pop((camera.name, time_ns), None)
         except ValueError:
-            continue  # `read_content` has already made a note of it
-        if target is None:
+            continue  # `read_content` has already made a note of this message
+        if target is None:  # the image is in no frame, or its file exists
             continue
         where = f"camera {camera.name!r}, image at {target.stem} ns"
         try:

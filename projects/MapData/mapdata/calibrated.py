@@ -15,7 +15,7 @@ from gsmap.utils.errors import InputError
 from mapdata.folders.calibration_file import read_vehicle
 from mapdata.folders.rig import RigCamera, RigFrame, rig_samples
 
-_KEYS = {"name", "path", "timestamp_ns"}
+_KEYS = {"name", "path", "timestamp_ns"}  # keys that a camera of a record may have
 _POSE = "global_from_frame"
 
 
@@ -40,8 +40,10 @@ def calibrated_records(
         names poses, ``global_from_frame``.
 
     Raises:
-        ValueError: If the file is malformed, a camera is not in it, a camera has a key that the
-            file defines, or a record has no pose near its time.
+        FileNotFoundError: If the calibration file, or its file of poses, does not exist.
+        ValueError: If the file is malformed, if a camera is not in it or has a key that the file
+            defines, if a record has no pose near its time, or if a record has a pose and the file
+            names poses, too.
     """
     # Images of each camera. Their size is used if the calibration file has no ``size_px``.
     images: dict[str, list[Path]] = {}
@@ -49,6 +51,7 @@ def calibrated_records(
     # by these names. If several images have one name, the time of the last image is used.
     time_of: dict[str, int] = {}
     for number, record in enumerate(records):
+        # Errors in this context get the name of the record, and the advice.
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             for camera in record["cameras"]:
                 _require_keys(camera, file)
@@ -56,6 +59,7 @@ def calibrated_records(
                 time_of[Path(camera["path"]).stem] = _time_of(camera, record)
     rig, poses = read_vehicle(file, images=images, time_of=time_of)
     camera_of = {camera.name: camera for camera in rig}
+    # Pose of the road below the vehicle at a time. Cached, since cameras often share their times.
     pose_at = None if poses is None else cache(poses.at)
     for number, record in enumerate(records):
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
@@ -64,7 +68,7 @@ def calibrated_records(
                 raise InputError(f"{_POSE} is given, and {file} has poses, too: leave out one.")
             scene = str(record.get("scene") or "")
             samples = rig_samples(scene, rig, frames=[frame], pose_at=pose_at)
-            if not samples:
+            if not samples:  # `rig_samples` leaves out a frame without a pose
                 raise InputError(f"{file} has no pose near timestamp_ns {frame.time_ns}.")
             sample = _in_frame(samples[0], record=record, meta=meta)
             completed = {**record, "ego_from_frame": sample.ego_from_frame}
@@ -73,7 +77,7 @@ def calibrated_records(
             cameras = []
             for camera in sample.cameras:
                 rig_camera = camera_of[camera.name]
-                entry = dict(vars(camera))
+                entry = dict(vars(camera))  # a copy of the fields of the sample's camera
                 entry["distortion"] = rig_camera.distortion
                 entry["distortion_model"] = rig_camera.model
                 cameras.append(entry)
@@ -107,7 +111,7 @@ def _time_of(camera: Mapping[str, Any], record: Mapping[str, Any]) -> int:
 def _rig_frame(
     record: Mapping[str, Any], camera_of: Mapping[str, RigCamera], file: Path
 ) -> RigFrame:
-    """Collect the images of a record by camera.
+    """Collect the images of a record by camera, as the input of `rig_samples`.
 
     Raises:
         ValueError: If the calibration file lacks a camera.
@@ -131,7 +135,8 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
     if ego_from_frame is None:
         mount = Mount(meta.frame, ground_z_m=ground_z_m)
     else:
-        # This copy of the sample only serves to compute where the annotation frame is mounted.
+        # `ground_from_frame` reads the mounting from a sample. So the mounting is set in a copy,
+        # which has no other use.
         sample_with_mount = replace(sample, ego_from_frame=np.asarray(ego_from_frame, np.float64))
         ground = ground_from_frame(sample_with_mount, meta.frame, ground_z_m=ground_z_m)
         mount = Mount(meta.frame, ground_z_m=ground_z_m, ground_from_frame=ground)

@@ -36,7 +36,8 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
         The samples.
 
     Raises:
-        FileNotFoundError: If the input, or a file that the input names, does not exist.
+        FileNotFoundError: If the input, or a file that the input names, does not exist, or if a
+            folder contains no input.
         ValueError: If the path is no such input, or the input is damaged. The message contains the
             reason.
     """
@@ -44,6 +45,8 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
     options = options or InputOptions()
     if not path.exists():
         raise FileNotFoundError(f"There is no input {path}.")
+    # A folder that contains files of bags (`parts_in`) need not be a bag. Another input in it takes
+    # precedence, see the order in `_open_folder`.
     may_be_bag = is_bag(path) or (path.is_dir() and bool(parts_in(path)))
     if not may_be_bag and (options.topics or options.calibration):
         raise InputError(f"--topics and --calibration belong to a bag, and {path} is none.")
@@ -62,27 +65,36 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
         root = options.data_root or path.parent
         samples = read_info_file(path, root, allow_missing_cameras=options.allow_missing_cameras)
         return Source(samples, frame="lidar", data_root=root)
-    if path.suffix in (".yaml", ".yml", ".json"):
+    if path.suffix in (".yaml", ".yml", ".json"):  # a calibration file
+        # `options.trained` has the image sizes and intrinsics of the cameras that a model was
+        # trained on. Images of distorted cameras are rectified to them.
         return read_image_folder(path, frames_dir=options.frames_dir, trained=options.trained)
-    advice = suffix_advice(path)
+    advice = suffix_advice(path)  # for a file that is probably a bag, such as a packed one
     if advice:
         raise InputError(f"{path} cannot be used: {advice}.")
     raise InputError(f"{path} is no input: it must be {KINDS}.")
 
 
 def _open_folder(folder: Path, options: InputOptions) -> Source:
-    """Read the samples of a folder, with the reader for its content."""
-    if versions_in(folder):
+    """Read the samples of a folder, with the reader for its content.
+
+    The first kind of input that is found is read, and bags come last. So a data set or a
+    calibration file may lie beside its bags.
+    """
+    if versions_in(folder):  # tables of nuScenes
         samples, notes = read_nuscenes(folder, options.version)
         return Source(samples, frame="lidar", data_root=folder, notes=notes)
-    logs = logs_in(folder)
+    logs = logs_in(folder)  # logs of Argoverse 2
     if logs:
+        # The paths of the samples are relative to the root and begin with the name of a log. So the
+        # root is above the log if the folder is a log itself.
         root = folder.parent if logs == [folder] else folder
         samples, left_out = read_logs(logs, root, rate_hz=options.rate_hz)
         log_notes = []
-        for reason, count in left_out.items():
+        for reason, count in left_out.items():  # logs and samples that are left out, by reason
             log_notes.append(f"{len(samples)} samples used, left out: {count} for {reason}")
         return Source(samples, frame="ego", data_root=root, notes=tuple(log_notes))
+    # The calibration files of the folder or, without any, its annotation and info files.
     files = [folder / name for name in CALIBRATION_NAMES if (folder / name).is_file()]
     if not files:
         for pattern in _FILES:

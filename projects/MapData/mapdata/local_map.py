@@ -1,4 +1,9 @@
-"""Patch of a map around a sample, and geometry that is cut with it."""
+"""Patch of a map around a sample, and geometry that is cut with it.
+
+Three coordinate frames are used, all in metres. The *map's frame* is global. The *annotation frame*
+is the frame of a sample in 3D. The *patch's frame* is in the plane: it has the position and the yaw
+of the annotation frame in the map, but no height, roll or pitch.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,8 +28,8 @@ class LocalPatch:
 
     Args:
         global_from_frame: Pose of the annotation frame in the map, in metres, finite. (4, 4)
-        x_range: Smallest and largest x in the frame, in metres.
-        y_range: Smallest and largest y in the frame, in metres.
+        x_range: Smallest and largest x of the rectangle in the patch's frame, in metres.
+        y_range: Smallest and largest y of the rectangle in the patch's frame, in metres.
 
     Raises:
         ValueError: If the pose has another shape, or is not finite.
@@ -41,8 +46,8 @@ class LocalPatch:
 
     @cached_property
     def rotation(self) -> np.ndarray:
-        """Unit vectors of the x and y axis of the patch in the map, as columns. (2, 2)"""
-        x_axis = self.global_from_frame[:2, 0]
+        """Unit vectors of the x and y axis of the patch's frame in the map, as columns. (2, 2)"""
+        x_axis = self.global_from_frame[:2, 0]  # shorter than 1 if the frame is tilted
         cos, sin = x_axis / np.hypot(x_axis[0], x_axis[1])
         return np.array([[cos, -sin], [sin, cos]])
 
@@ -53,11 +58,14 @@ class LocalPatch:
         y0, y1 = self.y_range
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
         polygon = shapely.Polygon(corners @ self.rotation.T + self.global_from_frame[:2, 3])
-        shapely.prepare(polygon)
+        shapely.prepare(polygon)  # makes repeated tests with the polygon faster
         return polygon
 
     def box(self, margin_m: float) -> shapely.Polygon:
-        """The rectangle in the frame of the patch, enlarged by ``margin_m`` on every side."""
+        """The rectangle in the patch's frame, enlarged by ``margin_m`` metres on every side.
+
+        A negative margin shrinks it.
+        """
         x0, x1 = self.x_range
         y0, y1 = self.y_range
         return shapely.box(
@@ -77,7 +85,7 @@ class LocalPatch:
         return shapely.transform(geometries, self.points_to_local)
 
     def to_frame(self, geometries: np.ndarray) -> np.ndarray:
-        """Transform geometries with heights to the annotation frame, with roll and pitch. (n,)
+        """Transform geometries of the map to the annotation frame, with roll and pitch. (n,)
 
         Points without a height get the height of the frame's origin.
         """
@@ -85,7 +93,7 @@ class LocalPatch:
         translation = self.global_from_frame[:3, 3]
 
         def transform_points(points: np.ndarray) -> np.ndarray:
-            x, y, z = (points - translation).T
+            x, y, z = (points - translation).T  # z is NaN for a point without a height
             z = np.where(np.isnan(z), 0.0, z)
             columns = [row[0] * x + row[1] * y + row[2] * z for row in rotation]
             return np.stack(columns, axis=-1)
@@ -107,7 +115,7 @@ class GeometryLayer:
 
     def __init__(self, geometries: Sequence[shapely.Geometry] | np.ndarray) -> None:
         self.geometries = np.array(list(geometries), dtype=object)
-        self._valid = np.flatnonzero(shapely.is_valid(self.geometries))
+        self._valid = np.flatnonzero(shapely.is_valid(self.geometries))  # indices
         self._tree = shapely.STRtree(self.geometries[self._valid])
 
     @property
@@ -116,12 +124,15 @@ class GeometryLayer:
         return len(self.geometries) - len(self._valid)
 
     def touching(self, patch: LocalPatch) -> np.ndarray:
-        """Indices of the valid geometries that intersect the patch, ascending. (m,)"""
-        found = self._tree.query(patch.polygon, predicate="intersects")  # indices into `_valid`
-        return np.sort(self._valid[found])
+        """Indices of the valid geometries that intersect the patch, ascending. (m,)
+
+        They are indices into ``geometries``.
+        """
+        positions = self._tree.query(patch.polygon, predicate="intersects")  # in `_valid`
+        return np.sort(self._valid[positions])
 
     def near(self, patch: LocalPatch) -> np.ndarray:
-        """Valid geometries that intersect the patch, in their order. (m,)"""
+        """Valid geometries that intersect the patch, in the order of ``geometries``. (m,)"""
         return self.geometries[self.touching(patch)]
 
 
@@ -131,7 +142,8 @@ def is_line(geometries: np.ndarray) -> np.ndarray:
 
 
 def vertices_of(lines: Sequence[shapely.Geometry] | np.ndarray, dim: int) -> list[np.ndarray]:
-    """Vertices of each line, in ``dim`` coordinates. each (n, dim)"""
+    """Vertices of each line that has any, in ``dim`` (2 or 3) coordinates. each (n, dim)"""
+    # `owner` is the index of the line of each point, in rising order.
     points, owner = shapely.get_coordinates(lines, include_z=dim == 3, return_index=True)
     if not len(points):
         return []
@@ -144,10 +156,11 @@ def rings_of(polygons: np.ndarray) -> np.ndarray:
 
     (n,) -> (rings,)
     """
-    rings, owner = shapely.get_rings(polygons, return_index=True)
+    rings, owner = shapely.get_rings(polygons, return_index=True)  # owner: index of the polygon
     is_hole = np.zeros(len(rings), dtype=bool)
     is_hole[1:] = owner[1:] == owner[:-1]  # a polygon's first ring is its exterior
-    is_reversed = shapely.is_ccw(rings) != is_hole  # holes must be anticlockwise, exteriors not
+    # Holes must be anticlockwise, and exteriors clockwise. All other rings are reversed.
+    is_reversed = shapely.is_ccw(rings) != is_hole
     rings[is_reversed] = shapely.reverse(rings[is_reversed])
     return rings
 
@@ -155,8 +168,11 @@ def rings_of(polygons: np.ndarray) -> np.ndarray:
 class OutlineIndex:
     """Rings of a map with a spatial index of short chunks, so that long rings are cut quickly.
 
+    A chunk is a part of a ring with at most 32 segments. The last point of a chunk is the first
+    point of the next one.
+
     Args:
-        rings: Simple rings in the map's frame, in metres. (n,)
+        rings: Rings in the map's frame, in metres, that do not cross themselves. (n,)
     """
 
     def __init__(self, rings: np.ndarray) -> None:
@@ -173,14 +189,18 @@ class OutlineIndex:
     def clip(self, patch: LocalPatch, margin_m: float) -> list[np.ndarray]:
         """Clip the rings to a patch that is shrunk by ``margin_m`` on each side.
 
+        The margin has the opposite sign of the margin of `LocalPatch.box`.
+
         Args:
             patch: The patch.
-            margin_m: Distance of the clipping rectangle from the sides of the patch, in metres.
+            margin_m: Distance of the sides of the patch from the clipping rectangle inside, in
+                metres.
 
         Returns:
             Parts inside, in the patch's frame, in metres; a ring that is wholly inside stays
             closed. each (n, 2)
         """
+        # Ascending indices of the chunks that intersect the patch. A ring has consecutive indices.
         near = np.sort(self._tree.query(patch.polygon, predicate="intersects"))
         x0, x1 = patch.x_range
         y0, y1 = patch.y_range
@@ -192,20 +212,21 @@ class OutlineIndex:
             for run in self._runs(chunks_of_ring):
                 parts = [self._chunks[run[0]]]
                 for chunk in run[1:]:
-                    parts.append(self._chunks[chunk][1:])  # chunks share a point
+                    parts.append(self._chunks[chunk][1:])  # without the point that chunks share
                 points = patch.points_to_local(np.concatenate(parts))
                 pieces += clip_to_box(points, x_range=x_range, y_range=y_range)
         return pieces
 
     def _runs(self, chunks: np.ndarray) -> list[np.ndarray]:
-        """Group ascending chunks of one ring into runs of consecutive chunks."""
+        """Group ascending chunks of one ring into runs of consecutive chunks along the ring."""
         gaps = np.flatnonzero(np.diff(chunks) > 1) + 1
         runs = np.split(chunks, gaps)
         chunks_of_ring = np.flatnonzero(self._owners == self._owners[chunks[0]])
         touches_start = chunks[0] == chunks_of_ring[0]
         touches_end = chunks[-1] == chunks_of_ring[-1]
         if len(runs) > 1 and touches_start and touches_end:
-            # The last run goes on beyond the start of the ring, where the first run continues it.
+            # The last chunk of a ring ends where its first chunk starts. The last run is therefore
+            # continued by the first run.
             last_run = runs.pop()
             runs[0] = np.concatenate([last_run, runs[0]])
         return runs

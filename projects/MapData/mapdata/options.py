@@ -12,19 +12,21 @@ class InputOptions:
     Args:
         data_root: Folder that paths of an annotation or info file are relative to.
         allow_missing_cameras: Whether an info file may name images that do not exist.
-        version: Version folder of a nuScenes-format root; None takes the only one.
+        version: Name of the version folder in a nuScenes-format root, such as ``v1.0-mini``; None
+            takes the only one.
         rate_hz: Samples per second of Argoverse 2 logs and bags; None takes all.
         frames_dir: Folder for images that have to be written: images of bags, and rectified images
             of distorted cameras. Each input gets a folder in it.
         vehicle_frame: Name of the vehicle's frame (x ahead, y left, z up) in a bag's transforms;
             None takes ``base_footprint`` or ``base_link``.
-        vehicle_ground_z_m: Height of the road in that frame in metres; None is 0.
-        topics: Topics of the images and of the camera info of a bag, by camera (``parse_topics``).
+        vehicle_ground_z_m: Height of the road in the vehicle's frame in metres; None is 0.
+        topics: Topic of the images and topic of the camera info (empty if not given) of a bag, by
+            the name of the camera. ``parse_topics`` reads them from the command line.
         calibration: Calibration file of a bag's cameras, in place of their camera info and
             transforms. The topic of a camera is its entry ``images`` in the file, or its name.
         trained: Width, height, fx, fy, cx and cy of the cameras that a model was trained on, by
             name (``load_model(...).rig``). An image of a distorted camera with one of these names
-            is rectified to the size and the intrinsics of that name.
+            is rectified to the size and the intrinsics under this name.
     """
 
     data_root: Path | None = None

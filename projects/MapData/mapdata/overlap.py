@@ -27,9 +27,9 @@ OVERLAP_DISTANCE_M = 5.0
 # Distances of the report. The maps of two samples, patches of 60 x 30 m, overlap up to a distance
 # of 30 m if they are side by side, and up to 60 m if one is behind the other.
 _DISTANCES_M = (5.0, 15.0, 30.0, 60.0)
-# Positions (x, y) of samples in metres, by split and by map name.
+# Positions (x, y) of samples in metres, by split and then by map name.
 Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
-# Positions (x, y) of samples in metres, by map name.
+# Positions (x, y) of samples in metres, by map name: arrays (n, 2), or lists of arrays (2,).
 _ByMap = Mapping[str, Sequence[np.ndarray] | np.ndarray]
 
 
@@ -87,6 +87,7 @@ def read_places(paths: Sequence[Path]) -> Places:
         file_maps = file.column("map_name")
         # A conversion that does not know the names of the maps writes the scene as map name.
         has_common_maps = file_scenes != file_maps
+        # In a file of samples without known poses, the option "poses" is False.
         if not file.meta.options.get("poses", True) or not has_common_maps:
             raise InputError(
                 f"{path} does not say where its samples are on common maps: make it from the data "
@@ -115,7 +116,8 @@ def nearest_by_map(train: _ByMap, val: _ByMap) -> dict[str, tuple[np.ndarray, np
     Returns:
         Two arrays for each map with validation samples, by its name. First, the distance of each
         validation sample in metres, infinite if the map has no training sample. (m,) Second, the
-        row of its nearest training sample among the training samples of the map. (m,)
+        row of its nearest training sample among the training samples of the map. (m,) The row has
+        no meaning where the distance is infinite.
     """
     nearest = {}
     for name, positions in val.items():
@@ -124,7 +126,7 @@ def nearest_by_map(train: _ByMap, val: _ByMap) -> dict[str, tuple[np.ndarray, np
             if len(train_positions) == 0:
                 train_positions = np.empty((0, 2))
             tree = cKDTree(train_positions)
-            nearest[name] = tree.query(positions)
+            nearest[name] = tree.query(positions)  # distances and rows
     return nearest
 
 
@@ -146,6 +148,7 @@ def overlap_share(train: _ByMap, val: _ByMap) -> float:
 
 def overlap_notes(positions: Positions) -> list[str]:
     """List with a warning about validation samples near training samples; empty if none is near."""
+    # The names may have a prefix, as in nuScenes' split "mini_train".
     train = next((split for split in positions if split.endswith("train")), "")
     val = next((split for split in positions if split.endswith("val")), "")
     if not train or not val:
@@ -176,6 +179,7 @@ def sample_overlap(train: Places, val: Places) -> tuple[np.ndarray, np.ndarray]:
     train_rows = train.by_map()
     val_rows = val.by_map()
     by_map = nearest_by_map(train.positions_by_map(), val.positions_by_map())
+    # `rows` count the training samples of one map. `train_rows` gives their rows in `train`.
     for name, (distances, rows) in by_map.items():
         distance[val_rows[name]] = distances
         if name in train_rows:
@@ -205,7 +209,7 @@ def draw_overlap(train: Places, val: Places, distance_m: np.ndarray) -> "Figure"
     rows = math.ceil(len(names) / columns)
     figure, axes = panel_grid(rows, columns)
     near = distance_m <= OVERLAP_DISTANCE_M
-    layers = (
+    layers = (  # label, samples and colour; later layers cover earlier ones
         ("training", train, "#C3C9D1"),
         ("validation", val.select(~near), "#1F6FB2"),
         ("validation within 5 m", val.select(near), "#C8321E"),
@@ -218,12 +222,12 @@ def draw_overlap(train: Places, val: Places, distance_m: np.ndarray) -> "Figure"
                 positions[:, 1],
                 s=1.5,
                 color=colour,
-                label=label if name == names[0] else None,
+                label=label if name == names[0] else None,  # only the first panel has a legend
                 linewidths=0,
                 rasterized=True,
             )
         ax.set_aspect("equal", "datalim")
-        title = name.replace("$", "") or "map"
+        title = name.replace("$", "") or "map"  # matplotlib reads "$" as the start of a formula
         finish_panel(ax, title, "x (m)", "y (m)", legend={"markerscale": 5})
     for ax in axes.flat[len(names) :]:
         ax.set_axis_off()

@@ -20,7 +20,7 @@ from mapdata.decompression import begin_bag, import_bounded
 _MOST_FIELDS = 10_000
 _MOST_LETTERS = 100_000  # largest size of the definition of a type
 
-Parser = Callable[[bytes], Any]
+Parser = Callable[[bytes], Any]  # from the content of a message to the message
 
 
 @contextmanager
@@ -61,6 +61,7 @@ class RosTypes:
         self._field_count = 0
 
     def _empty_store(self) -> Any:
+        """Type store of rosbags without types. A store holds types and their generated parsers."""
         return self._typesys.get_typestore(self._typesys.Stores.EMPTY)
 
     def parser(self, msgtype: str, definition: str, is_idl: bool, is_ros1: bool) -> Parser:
@@ -115,7 +116,13 @@ class RosTypes:
         nodes = self._typesys.base.Nodetype
 
         def count_values(node: Any, description: Any) -> int:
-            """Least number of values of a field."""
+            """Least number of values of a field.
+
+            Args:
+                node: Kind of the field's type: basic, another message, array or sequence.
+                description: For a basic type, its name first. For a message, the name of its type.
+                    For an array or a sequence, node and description of its items, and their number.
+            """
             if node == nodes.BASE:
                 return 1
             if node == nodes.NAME:
@@ -137,6 +144,7 @@ class RosTypes:
                 # Ends the recursion if the type contains itself; rosbags rejects such a type.
                 counts[name] = 1
                 constants, fields = known_types[name]
+                # A field is its name, then node and description of its type.
                 values = sum(count_values(node, description) for _, (node, description) in fields)
                 counts[name] = values
                 self._field_count += len(constants) + values
@@ -153,21 +161,25 @@ class RosTypes:
 
 @cache
 def _standard_store() -> Any:
-    """Types of ROS 2 Humble."""
+    """Type store with the types of ROS 2 Humble."""
     typesys = import_extra("rosbags.typesys", extra="bags")
     return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
 
 def _parse_types(typesys: Any, msgtype: str, definition: str, is_idl: bool) -> dict[str, Any]:
-    """Parse the types of a definition."""
+    """Parse the types of a definition, which also contains the types of nested messages.
+
+    A definition in IDL may have several sections. Each begins with a line of "=" and a line
+    ``IDL: name``.
+    """
     if not is_idl:
         return dict(typesys.get_types_from_msg(definition, msgtype))
     separator = "=" * 80 + "\n"
     if not definition.startswith(f"{separator}IDL: "):
         return dict(typesys.get_types_from_idl(definition))
     types: dict[str, Any] = {}
-    for part in definition.split(separator)[1:]:
-        text = part.partition("\n")[2]  # below the line ``IDL: name``
+    for section in definition.split(separator)[1:]:
+        text = section.partition("\n")[2]  # below the line ``IDL: name``
         types |= typesys.get_types_from_idl(text)
     return types
 
@@ -203,6 +215,7 @@ class RosBag:
         reader_type = import_bounded(module).Reader
         for path in self.paths:
             with library_errors():
+                # rosbags builds an address of the file from the path.
                 reader = reader_type(_AddressedPath(path))
                 reader.open()
             self._readers.append(reader)
@@ -228,7 +241,11 @@ class RosBag:
         return topics
 
     def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        """Yield connection, time in nanoseconds and content of messages, in order of time."""
+        """Yield connection, time in nanoseconds and content of messages, in order of time.
+
+        Args:
+            connections: Connections whose messages are read, entries of ``connections``.
+        """
         # Connections are tuples with long texts (definitions), so their identities are compared.
         selected_ids = set(map(id, connections))
         streams = []

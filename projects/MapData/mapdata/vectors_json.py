@@ -22,7 +22,13 @@ _GROUND_TRUTH = "GTs"  # key of the samples in MapTR's format
 
 
 def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
-    """Name, time and pose of a sample. ``row`` is its row in the pose table of its log, or None."""
+    """Name, time and pose of a sample, in the keys of Argoverse 2 or of nuScenes.
+
+    Args:
+        sample: The sample.
+        row: Its row in the pose table of its log, if samples were chosen by such rows. This is the
+            case in Argoverse 2 only. None for all other samples.
+    """
     pose = sample.global_from_frame
     if row is not None:
         return {
@@ -61,9 +67,10 @@ def write_vectors(annotations: Sequence[Path], target: Path) -> int:
     names = ("dataset", "frame", "classes", "x_range", "y_range")
     common = {name: getattr(meta, name) for name in names}
     for file in files:
-        file.require(**common)
+        file.require(**common)  # raises an error if a value differs
     splits = [file.meta.split for file in files]
     head = {**common, "split": splits, "versions": meta.versions}
+    # The samples are written one by one, so that they never are in memory together.
     with atomic_write(target) as out:
         out.write(f'{{"meta": {json.dumps(head)}, "{_GROUND_TRUTH}": [')
         count = 0
@@ -78,8 +85,9 @@ def write_vectors(annotations: Sequence[Path], target: Path) -> int:
 
 def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
     """Yield the samples as JSON objects, with their rows in the pose table if these are known."""
+    # With the option ``at="poses:N"``, every N-th row of the pose table of a log is a sample.
     match = re.fullmatch(r"poses:(\d+)", str(file.meta.options.get("at")))
-    stride = int(match[1]) if match else None  # every N-th row is a sample
+    stride = int(match[1]) if match else None
     counts: Counter[str] = Counter()  # number of previous samples of each log
     for sample in file:
         if sample.instances is None:

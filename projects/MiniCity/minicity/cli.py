@@ -60,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 
 
+# Options that a preset sets. Except for ``image_size``, these are also fields of `MiniCityConfig`.
 SIZE_OPTIONS = (
     "scenes",
     "seed",
@@ -79,6 +80,9 @@ def chosen_config(arguments: argparse.Namespace) -> MiniCityConfig:
     Args:
         arguments: Parsed options of ``add_arguments``.
 
+    Returns:
+        Configuration. Options that are not given have the defaults of `MiniCityConfig`.
+
     Raises:
         ValueError: If neither a preset nor ``--scenes`` is given, if a preset is given together
             with an option of size, or if a value is out of range.
@@ -86,7 +90,7 @@ def chosen_config(arguments: argparse.Namespace) -> MiniCityConfig:
     values: dict[str, Any] = {}
     for name in SIZE_OPTIONS:
         value = getattr(arguments, name)
-        if value is not None:
+        if value is not None:  # the option was given
             values[name] = value
     if arguments.preset is not None:
         if values:
@@ -110,10 +114,11 @@ def run(arguments: argparse.Namespace) -> str:
             ``command``.
 
     Returns:
-        Summary for the user: the folder, and the command that generated it.
+        Summary for the user: the folder and the command that generated it, or a note that the data
+        set was complete already.
     """
     config = chosen_config(arguments)
-    is_new = generate(
+    is_new = generate(  # False if the folder already contains this data set
         root=arguments.root,
         scenes=config.scenes,
         seed=config.seed,

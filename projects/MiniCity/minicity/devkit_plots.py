@@ -48,10 +48,11 @@ def run(arguments: argparse.Namespace) -> str:
             f"no MiniCity at {arguments.root}: make it with python -m minicity generate --root "
             f"{arguments.root} --scenes 10"
         )
+    # Imported after the check above, since the devkit is slow to import.
     from nuscenes import NuScenes
     from nuscenes.map_expansion.map_api import NuScenesMap
 
-    mpl.use("Agg")
+    mpl.use("Agg")  # writes files and opens no window
     repair_descartes()
     nusc = NuScenes(VERSION, arguments.root, verbose=False)
     if not 0 <= arguments.sample < len(nusc.sample):
@@ -64,6 +65,7 @@ def run(arguments: argparse.Namespace) -> str:
     scene = nusc.get("scene", sample["scene_token"])
     log = nusc.get("log", scene["log_token"])
     lidar = nusc.get("sample_data", sample["data"]["LIDAR_TOP"])
+    # Position of the vehicle in the town, in metres, at the time of the LiDAR sweep.
     x, y, _ = nusc.get("ego_pose", lidar["ego_pose_token"])["translation"]
     patch = (x - RADIUS_M, y - RADIUS_M, x + RADIUS_M, y + RADIUS_M)
     town = NuScenesMap(arguments.root, log["location"])
@@ -74,14 +76,14 @@ def run(arguments: argparse.Namespace) -> str:
 
 def polygon_path(polygon: Polygon | MultiPolygon) -> Outline:
     """Convert a polygon with holes to a matplotlib path."""
-    rings = []
+    rings = []  # coordinates of the outlines and the holes, (n, 2) each
     for part in get_parts(polygon):
         if not part.is_empty:
             for ring in (part.exterior, *part.interiors):
                 rings.append(np.asarray(ring.coords)[:, :2])
     if not rings:
         return Outline(np.zeros((0, 2)))
-    codes = []  # how matplotlib reaches each vertex
+    codes = []  # for each vertex: start of a ring (MOVETO), or end of a straight line (LINETO)
     for ring in rings:
         ring_codes = np.full(len(ring), Outline.LINETO, dtype=Outline.code_type)
         ring_codes[0] = Outline.MOVETO
@@ -90,5 +92,8 @@ def polygon_path(polygon: Polygon | MultiPolygon) -> Outline:
 
 
 def repair_descartes() -> None:
-    """Make ``descartes.PolygonPatch`` accept shapely 2 polygons, in this process."""
+    """Make ``descartes.PolygonPatch`` accept shapely 2 polygons, in this process.
+
+    ``PolygonPatch`` calls ``PolygonPath``, which `polygon_path` replaces.
+    """
     descartes.patch.PolygonPath = polygon_path

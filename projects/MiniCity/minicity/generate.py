@@ -28,10 +28,10 @@ from minicity.rig import CAMERAS, ego_from_lidar, quaternion
 from minicity.scene import Records, SceneMaker, SceneTask
 from minicity.town import Town, make_town
 
-MARKER = "minicity.json"
+MARKER = "minicity.json"  # file with the configuration, in the folder of a complete data set
 BEFORE = ".before"  # suffix of a town's name, for its map before streets are repainted
-CHANGES = "changes.geojson"
-TABLES = [
+CHANGES = "changes.geojson"  # file with the changes of the map by the repainting
+TABLES = [  # tables of nuScenes, each a JSON file
     "category",
     "attribute",
     "visibility",
@@ -55,7 +55,8 @@ def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
     """Name the scenes after the official split and distribute them among the towns.
 
     In each pass, every street is driven once. The scenes of a pass come before the scenes of the
-    next pass.
+    next pass. The names are names of nuScenes' scenes, so that each scene is in the split that its
+    name has in nuScenes.
     """
     from nuscenes.utils import splits
 
@@ -65,10 +66,11 @@ def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
         (splits.val, config.num_val, VAL_LOCATIONS),
     ):
         for i, name in enumerate(names[: count * config.passes]):
-            pass_index, street = divmod(i, count)
+            pass_index, street = divmod(i, count)  # `count` is the number of streets
             location = locations[street % len(locations)]
             is_new = pass_index >= config.passes - config.new_passes
             has_old_paint = config.repainted > 0 and not is_new
+            # Streets are dealt to the towns in turn.
             task = SceneTask(
                 name=name,
                 index=len(tasks),
@@ -142,6 +144,7 @@ def generate(
     if is_complete(root, config):
         LOGGER.info("%s is complete already: nothing to do.", root)
         return False
+    # The folder keeps another name until all files are written.
     with _partial_folder(root) as folder:
         _fill(folder, config, workers=workers, progress=progress)
         (folder / MARKER).write_text(json.dumps(config.as_dict(), indent=2) + "\n")
@@ -167,17 +170,16 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
             return True
         if not isinstance(present, dict):
             raise InputError(f"{marker} is another program's file: choose another --root.")
-        parts = []
+        differences = []
         for key in sorted({*present, *requested}):
-            # Some fields with the default value are left out of the marker.
+            # The marker omits some fields if they have their default value.
             default = getattr(MiniCityConfig, key, None)
-            found = present.get(key, default)
-            wanted = requested.get(key, default)
-            if found != wanted:
-                parts.append(f"{key} is {found}, asked for {wanted}")
-        differences = ", ".join(parts)
+            present_value = present.get(key, default)
+            requested_value = requested.get(key, default)
+            if present_value != requested_value:
+                differences.append(f"{key} is {present_value}, asked for {requested_value}")
         raise InputError(
-            f"{root} holds another MiniCity data set ({differences}): "
+            f"{root} holds another MiniCity data set ({', '.join(differences)}): "
             "choose another --root or remove that folder."
         )
     is_empty_folder = root.is_dir() and not any(root.iterdir())
@@ -191,18 +193,32 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
 
 @contextmanager
 def _partial_folder(root: Path) -> Iterator[Path]:
-    """Create and lock a folder beside ``root`` for writing, and delete it if writing fails."""
+    """Create and lock a folder beside ``root`` for writing, and delete it if writing fails.
+
+    The lock belongs to the open folder, so it lasts while the caller renames the folder to
+    ``root``. Files that a killed process left in the folder are deleted.
+
+    Args:
+        root: Folder of the data set.
+
+    Yields:
+        The empty folder.
+
+    Raises:
+        RuntimeError: If another process uses the folder.
+        ValueError: If the folder is a link.
+    """
     root.parent.mkdir(parents=True, exist_ok=True)
     folder = root.with_name(f"{root.name}{SUFFIX}")
     require_no_link(folder)
     folder.mkdir(exist_ok=True)
     handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW)
     try:
-        # `locked` is None on a disk without locks. There, a folder with files may be in use by
-        # another process.
+        # True: this process holds the lock now. False: another process holds it. None: the disk has
+        # no locks. In this case, a folder with files may be in use by another process.
         locked = try_lock(handle)
-        is_used = locked is False or (locked is None and any(folder.iterdir()))
-        if is_used:
+        may_be_used = locked is None and any(folder.iterdir())
+        if locked is False or may_be_used:
             raise WorkError(
                 f"another process is generating into {folder}: wait for its end. If there is no "
                 "other process, and this disk has no locks, remove that folder."
@@ -230,6 +246,7 @@ def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: boo
     (root / "can_bus").mkdir()
     tasks = plan_scenes(config)
     towns, masks = _make_towns(root, config, tasks=tasks)
+    # Rows of the nuScenes tables that each scene adds, by scene and then by table.
     records_by_scene = _run_scenes(
         root, config, tasks=tasks, towns=towns, workers=workers, progress=progress
     )
@@ -238,7 +255,7 @@ def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: boo
         for table, rows in records_by_scene[task.name].items():
             tables[table] += rows
     _add_fixed_tables(tables, config)
-    for name, filename in masks.items():
+    for name, filename in masks.items():  # pictures of the drivable area, by town
         log_tokens = [log["token"] for log in tables["log"] if log["location"] == name]
         tables["map"].append(
             {
@@ -272,12 +289,14 @@ def _make_towns(
         A location whose streets are repainted has two towns, before and after.
     """
     (root / "maps" / "expansion").mkdir(parents=True)
+    # In the first pass, each scene has another street.
     street_counts = Counter(task.location for task in tasks if task.pass_index == 0)
     towns = {}
     masks = {}
     changes = {}
     for name in (*TRAIN_LOCATIONS, *VAL_LOCATIONS):
         town = make_town(name, config.seed, num_scenes=street_counts[name])
+        # One picture is enough, since repainting does not change the drivable area.
         masks[name] = write_mask(root, town, seed=config.seed)
         if config.repainted > 0:
             towns[f"{name}{BEFORE}"] = town
@@ -292,7 +311,7 @@ def _make_towns(
 
 
 def _pass_table(config: MiniCityConfig, tasks: list[SceneTask]) -> list[dict[str, Any]]:
-    """Records of the street and pass of each scene."""
+    """Rows of the additional table ``passes.json``: street and pass of each scene."""
     records = []
     for task in tasks:
         records.append(
@@ -334,6 +353,7 @@ def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityC
     for level, share in enumerate(("0-40", "40-60", "60-80", "80-100"), start=1):
         tables["visibility"].append({"token": str(level), "level": f"v{share}", "description": ""})
     lidar_pose = ego_from_lidar()
+    # Channel, modality, transform from the sensor to the vehicle, and intrinsics (none for LiDAR).
     sensors: list[tuple[str, str, Any, list]] = [("LIDAR_TOP", "lidar", lidar_pose, [])]
     for mount in CAMERAS:
         intrinsics = mount.intrinsics(config.image_width, config.image_height).tolist()
@@ -356,6 +376,7 @@ def _make_scene(
     root: Path, config: MiniCityConfig, towns: dict[str, Town], task: SceneTask
 ) -> Records:
     """Make a scene in this process."""
+    # Without a parent process, this is the main process, where OpenCV may use all threads.
     if parent_process() is not None:  # this is one of several workers, which use one thread each
         cv2.setNumThreads(1)
     maker = SceneMaker(config, task, town=towns[task.expansion], root=root)
@@ -372,12 +393,21 @@ def _run_scenes(
 ) -> dict[str, Records]:
     """Make all scenes in worker processes.
 
+    Args:
+        root: Folder of the data set.
+        config: Configuration of the data set.
+        tasks: All scenes.
+        towns: Towns by the name of their map.
+        workers: Number of processes; None takes one per core, 0 or 1 works in this process.
+        progress: Whether to show a progress bar.
+
     Returns:
         Records of each scene, by its name and then by table.
     """
     wanted_workers = default_workers() if workers is None else max(workers, 1)
     workers = min(wanted_workers, len(tasks))
     make = partial(_make_scene, root, config, towns)
+    # Results come in the order of the tasks. The time limit is for one scene.
     results = ordered_map(make, tasks, workers, timeout_s=7200.0)
     images_per_scene = len(CAMERAS) * config.samples_per_scene
     num_images = images_per_scene * len(tasks)

@@ -1,4 +1,9 @@
-"""Map of a town in the format of the nuScenes map expansion."""
+"""Map of a town in the format of the nuScenes map expansion.
+
+The file has a list of records for each layer. A record is a dict with a token, by which other
+records refer to it. Shapes are records, too: a polygon or a line refers to its nodes. Fields that
+this town has no values for are empty.
+"""
 
 import json
 from itertools import pairwise
@@ -17,6 +22,7 @@ from minicity.paint import divider_pieces, lane_divider_offsets
 from minicity.roads import Lane, Road
 from minicity.town import Town, road_surface
 
+# All layers of the format. The file also has the layers without records.
 LAYERS = [
     "polygon",
     "line",
@@ -53,6 +59,7 @@ class MapWriter:
 
     def __init__(self, town: Town, seed: int) -> None:
         self.town = town
+        # A token has 32 hexadecimal digits: 24 of this prefix and 8 of a running number.
         self._prefixes = {layer: make_token(seed, town.name, layer)[:24] for layer in LAYERS}
         self.tables: dict[str, list[dict[str, Any]]] = {layer: [] for layer in LAYERS}
         self.arclines: dict[str, list[dict[str, Any]]] = {}
@@ -109,7 +116,8 @@ class MapWriter:
 
     def add_road(self, road: Road) -> None:
         """Add the surface, blocks, dividers, crossings and stop lines of a road."""
-        # A road with a median has two segments; the following records refer to the last one.
+        # A road with a median has two surfaces, each of which is a segment. The following records
+        # can refer to one segment only, and refer to the last one.
         for surface in road_surface(road):
             segment = self.add(
                 "road_segment",
@@ -128,6 +136,7 @@ class MapWriter:
                 divider = self.line(road.line(offset, start, end_m=end))
                 self.add("lane_divider", line_token=divider, lane_divider_segments=[])
         for start, end in road.crossings:
+            # A median interrupts a crossing.
             for right, left in road.carriageways():
                 crossing = Polygon(road.band(right, left, start_m=start, end_m=end))
                 self.add(
@@ -147,7 +156,7 @@ class MapWriter:
             segment: Token of the road segment.
             direction: ``forward`` or ``backward``.
         """
-        if len(edges) < 2:
+        if len(edges) < 2:  # no lane in this direction
             return
         band = Polygon(road.band(min(edges), max(edges)))
         self.add(
@@ -186,6 +195,8 @@ class MapWriter:
         """Add a lane with its outline and centre line, and return its token."""
         road = self.town.roads[lane.road]
         edges = road.forward_edges if lane.forward else road.backward_edges
+        # Edges run from the centre of the road to its kerb. Offsets are positive to the left, so
+        # the outer edge is the smaller one for forward lanes and the larger one for backward lanes.
         inner = edges[lane.index]
         outer = edges[lane.index + 1]
         outline = road.band(min(inner, outer), max(inner, outer))
@@ -204,6 +215,8 @@ class MapWriter:
     def add_connector(self, connector: Connector, source: str, target: str) -> None:
         """Add the path across a junction and connect it to its lanes.
 
+        The lanes must have been added before.
+
         Args:
             connector: The path.
             source: Token of the lane that leads to the junction.
@@ -221,20 +234,20 @@ class MapWriter:
 
         The connectivity gets an entry without neighbours, to which `add_connector` adds them.
         """
-        lengths = arc_lengths(center)
+        lengths = arc_lengths(center)  # from the first point to each point (n,)
         count = max(1, round(lengths[-1] / PIECE_M))
         arc_m = np.linspace(0.0, lengths[-1], num=count + 1)
         x = np.interp(arc_m, lengths, center[:, 0])
         y = np.interp(arc_m, lengths, center[:, 1])
         points = np.stack([x, y], axis=1)
         pieces = []
-        for a, b in pairwise(points):
-            yaw = float(np.arctan2(b[1] - a[1], b[0] - a[0]))
-            length = float(np.linalg.norm(b - a))
+        for start, end in pairwise(points):
+            yaw = float(np.arctan2(end[1] - start[1], end[0] - start[0]))
+            length = float(np.linalg.norm(end - start))
             pieces.append(
                 {
-                    "start_pose": [float(a[0]), float(a[1]), yaw],
-                    "end_pose": [float(b[0]), float(b[1]), yaw],
+                    "start_pose": [float(start[0]), float(start[1]), yaw],
+                    "end_pose": [float(end[0]), float(end[1]), yaw],
                     # A Dubins path: left turn, straight, right turn. Both turns have no length, so
                     # their radius has no effect.
                     "shape": "LSR",
@@ -264,7 +277,8 @@ def town_to_map(town: Town, seed: int) -> dict[str, Any]:
     writer = MapWriter(town, seed)
     for road in town.roads:
         writer.add_road(road)
-    lanes = {key: writer.add_lane(lane) for key, lane in town.lanes.items()}
+    # Token of each lane, by the key of the lane.
+    lane_tokens = {key: writer.add_lane(lane) for key, lane in town.lanes.items()}
     for junction in town.junctions:
         outline = writer.polygon(Polygon(junction.outline))
         writer.add(
@@ -272,8 +286,8 @@ def town_to_map(town: Town, seed: int) -> dict[str, Any]:
         )
     for connectors in town.connectors.values():
         for connector in connectors:
-            source = lanes[connector.source.key]
-            target = lanes[connector.target.key]
+            source = lane_tokens[connector.source.key]
+            target = lane_tokens[connector.target.key]
             writer.add_connector(connector, source, target=target)
     drivable = [writer.polygon(part) for part in polygon_parts(town.drivable)]
     writer.add("drivable_area", polygon_tokens=drivable)
@@ -289,7 +303,7 @@ def write_expansion(root: Path, town: Town, seed: int, name: str) -> None:
     """Write the expansion file of a town.
 
     Args:
-        root: Root folder of the data set, with the folder of maps.
+        root: Root folder of the data set, in which the folder ``maps/expansion`` exists.
         town: The town.
         seed: Seed of the data set, part of every token.
         name: Name of the file, without the suffix.
@@ -302,10 +316,10 @@ def write_expansion(root: Path, town: Town, seed: int, name: str) -> None:
 
 
 def write_mask(root: Path, town: Town, seed: int) -> str:
-    """Write the drivable-area picture of a town.
+    """Write the drivable-area picture of a town, 255 on the drivable area and 0 elsewhere.
 
     Args:
-        root: Root folder of the data set, with the folder of maps.
+        root: Root folder of the data set, in which the folder ``maps`` exists.
         town: The town.
         seed: Seed of the data set, part of every token.
 
@@ -323,6 +337,7 @@ def write_mask(root: Path, town: Town, seed: int) -> str:
             x, y = (ring / MASK_RESOLUTION_M).T
             # Row 0 of the picture is at the largest y.
             rings_px.append(np.round(np.column_stack([x, size - y])).astype(np.int32))
+        # Holes stay empty, because `fillPoly` fills points inside an odd number of rings.
         cv2.fillPoly(mask, rings_px, color=(255.0,))
     name = f"maps/{make_token(seed, town.name, 'mask')}.png"
     if not cv2.imwrite(str(root / name), mask):

@@ -1,4 +1,8 @@
-"""Repainting of streets of a town: crossings are removed or added, or dividers are moved."""
+"""Repainting of streets of a town: crossings are removed or added, or dividers are moved.
+
+Arc lengths are measured along the centre line of a road. Offsets are distances from this line,
+positive to the left.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,11 +18,11 @@ from minicity.town import Town, connect_lanes
 REMOVED = "removed"
 ADDED = "added"
 MOVED = "moved"
-MOVE_M = 1.0
-CROSSING_DEPTH_M = 3.2
+MOVE_M = 1.0  # distance by which dividers are moved sideways
+CROSSING_DEPTH_M = 3.2  # extent of an added crossing along the road
 CROSSING_CLEARANCE_M = 4.0  # least gap between an added crossing and a crossing or stop line
 SHORTEST_PIECE_M = 0.1  # shorter pieces of a divider between crossings are ignored
-Spans = list[tuple[float, float]]
+Spans = list[tuple[float, float]]  # arc lengths (start, end) in metres
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ class Change:
 
 
 def changes_geojson(changes_by_map: dict[str, list[Change]]) -> dict[str, Any]:
-    """Content of a GeoJSON file of changes, in metres in the global frames.
+    """Content of a GeoJSON file of changes, in metres in the global frames of the towns.
 
     Args:
         changes_by_map: Changes by the name of the town.
@@ -88,18 +92,21 @@ def repaint_town(town: Town, seed: int, share: float) -> tuple[Town, list[Change
     Args:
         town: The town, which is not changed.
         seed: Seed of the data set.
-        share: Share of the streets, in [0, 1].
+        share: Share of the streets, in [0, 1]. Fewer streets are repainted if the others offer no
+            way to change them.
 
     Returns:
         The repainted town, in which only roads, lanes and connectors are new, and all changes.
     """
     roads = list(town.roads)
     changes: list[Change] = []
-    wanted = round(share * len(roads))
+    num_wanted = round(share * len(roads))
+    # The state of a generator depends only on these arguments. So the changes of a street do not
+    # depend on the share.
     order = make_rng(seed, town.name, "repainted streets").permutation(len(roads))
     num_repainted = 0
     for index in order.tolist():
-        if num_repainted == wanted:
+        if num_repainted == num_wanted:
             break
         rng = make_rng(seed, town.name, "repaint", index)
         repainted = _repaint_road(roads[index], rng)
@@ -108,6 +115,7 @@ def repaint_town(town: Town, seed: int, share: float) -> tuple[Town, list[Change
         changes += list_changes(roads[index], repainted)
         roads[index] = repainted
         num_repainted += 1
+    # Lanes, and their connectors across junctions, follow the shifted lines.
     lanes, connectors = connect_lanes(roads, town.junctions)
     return replace(town, roads=roads, lanes=lanes, connectors=connectors), changes
 
@@ -115,13 +123,13 @@ def repaint_town(town: Town, seed: int, share: float) -> tuple[Town, list[Change
 def _repaint_road(road: Road, rng: np.random.Generator) -> Road | None:
     """Repaint a road in one of the possible ways, chosen at random; None if no way is possible."""
     middle_m = float(rng.uniform(low=0.35, high=0.65)) * road.length_m
-    added = (middle_m - CROSSING_DEPTH_M / 2, middle_m + CROSSING_DEPTH_M / 2)
-    kinds = []
+    new_crossing = (middle_m - CROSSING_DEPTH_M / 2, middle_m + CROSSING_DEPTH_M / 2)
+    kinds = []  # possible ways
     if road.crossings:
         kinds.append(REMOVED)
-    if _has_room(road, added):
+    if _has_room(road, new_crossing):
         kinds.append(ADDED)
-    if divider_offsets(road):
+    if divider_offsets(road):  # the road has dividers
         kinds.append(MOVED)
     if not kinds:
         return None
@@ -131,21 +139,21 @@ def _repaint_road(road: Road, rng: np.random.Generator) -> Road | None:
         crossings.pop(int(rng.integers(len(crossings))))
         return replace(road, crossings=crossings)
     if kind == ADDED:
-        return replace(road, crossings=[*road.crossings, added])
+        return replace(road, crossings=[*road.crossings, new_crossing])
     # Lines are shifted towards the wider shoulder, where there is room; a shift > 0 is to the left.
     has_room_left = road.section.left_shoulder_m > road.section.right_shoulder_m
     return replace(road, shift_m=MOVE_M if has_room_left else -MOVE_M)
 
 
-def _has_room(road: Road, added: tuple[float, float]) -> bool:
+def _has_room(road: Road, new_crossing: tuple[float, float]) -> bool:
     """Whether a new crossing keeps its clearance from the end of the paint and other crossings.
 
     Args:
         road: The road.
-        added: Arc lengths in metres between which the new crossing is.
+        new_crossing: Arc lengths in metres between which the new crossing is.
     """
-    start = added[0] - CROSSING_CLEARANCE_M
-    end = added[1] + CROSSING_CLEARANCE_M
+    start = new_crossing[0] - CROSSING_CLEARANCE_M
+    end = new_crossing[1] + CROSSING_CLEARANCE_M
     if start < road.clear_start_m or end > road.clear_end_m:
         return False
     return all(other_end < start or other_start > end for other_start, other_end in road.crossings)
@@ -157,6 +165,9 @@ def list_changes(before: Road, after: Road) -> list[Change]:
     Args:
         before: Road with the earlier paint.
         after: Road with the later paint.
+
+    Returns:
+        Changes of crossings, one for each carriageway, then changes of dividers.
     """
     changes = []
     for kind, crossings, others in (
@@ -166,13 +177,16 @@ def list_changes(before: Road, after: Road) -> list[Change]:
         for start, end in crossings:
             if (start, end) in others:
                 continue
+            # Offsets of both sides of each carriageway; a road with a median has two.
             for right, left in before.carriageways():
                 outline = before.band(right, left, start_m=start, end_m=end)
+                # The outline is closed by its first point.
                 ring = np.concatenate([outline, outline[:1]])
                 changes.append(_change(before.index, kind, class_name="ped_crossing", points=ring))
     if before.shift_m != after.shift_m:
         return changes + _moved_dividers(before, after)
-    # A new crossing interrupts the dividers, and a removed one no longer does.
+    # A new crossing interrupts the dividers, and a removed one no longer does. The pieces are the
+    # arc lengths (start, end) of the divider paint between crossings.
     pieces_before = divider_pieces(before)
     pieces_after = divider_pieces(after)
     for kind, pieces in (
@@ -213,7 +227,7 @@ def _change(street: int, kind: str, class_name: str, points: Array) -> Change:
 def _subtract(spans: Spans, others: Spans) -> Spans:
     """Parts of spans (start, end) that no span of ``others`` covers."""
     parts = spans
-    for other_start, other_end in others:
+    for other_start, other_end in others:  # each cuts the parts that the previous ones have left
         remaining = []
         for start, end in parts:
             # The parts before and after the other span; they may have a negative length.

@@ -13,7 +13,8 @@ from minicity.curves import Array
 BASE_WIDTH = 1600
 BASE_HEIGHT = 900
 LIDAR_POSITION = (0.94, 0.0, 1.84)  # in the ego frame (x forward, y left, z up), in metres
-# Camera axes (z forward, x right, y down) in the ego frame (x forward, y left, z up).
+# Columns: axes of a camera that looks ahead (x right, y down, z forward) in the ego frame
+# (x forward, y left, z up).
 _CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
@@ -27,6 +28,7 @@ class CameraMount:
         yaw_deg: Viewing direction in degrees, anticlockwise from ahead.
         focal_px: Focal length in pixels for an image 1600 pixels wide.
         delay_ms: Time of exposure relative to the LiDAR sweep of the key frame, in milliseconds.
+            Negative values are before the sweep.
     """
 
     channel: str
@@ -39,7 +41,8 @@ class CameraMount:
         """Intrinsic matrix for an image of ``width`` x ``height`` pixels. (3, 3)"""
         x_scale = width / BASE_WIDTH
         y_scale = height / BASE_HEIGHT
-        # Pixel centres are at integers, so the image begins at -0.5. The principal point lies 8
+        # Pixel centres are at integers, so the image begins at -0.5. The terms + 0.5 and - 0.5 make
+        # the scale apply to distances from the corner of the image. The principal point lies 8
         # columns and 30 rows from the middle of the full-size image.
         cx = (BASE_WIDTH / 2 + 8.0 + 0.5) * x_scale - 0.5
         cy = (BASE_HEIGHT / 2 + 30.0 + 0.5) * y_scale - 0.5
@@ -61,6 +64,7 @@ class CameraMount:
         return pose
 
 
+# The second argument is the position. The cameras are in clockwise order, the front one first.
 CAMERAS = (
     CameraMount("CAM_FRONT", (1.70, 0.02, 1.51), yaw_deg=0.0, focal_px=1260.0, delay_ms=-35.0),
     CameraMount(
@@ -98,12 +102,14 @@ def world_from_ego(x: float, y: float, yaw: float, pitch: float = 0.0, roll: flo
     Returns:
         Transform from the ego to the world frame, in metres. (4, 4)
     """
+    # c and s are the cosine and the sine of yaw (y), pitch (p) and roll (r).
     cy = math.cos(yaw)
     sy = math.sin(yaw)
     cp = math.cos(pitch)
     sp = math.sin(pitch)
     cr = math.cos(roll)
     sr = math.sin(roll)
+    # The rotation is R_z(yaw) R_y(pitch) R_x(roll), multiplied out.
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
@@ -137,5 +143,6 @@ def mounted_camera(mount: CameraMount, width: int, height: int, ego_pose: Array)
 
 def quaternion(pose: Array) -> list[float]:
     """Rotation of a pose as the unit quaternion w, x, y, z. (4, 4) -> 4 numbers"""
+    # SciPy has w last, and nuScenes has it first.
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
     return [float(w), float(x), float(y), float(z)]

@@ -1,6 +1,6 @@
 """Files of map priors for a model that reads one.
 
-A map prior is the map of a place from earlier drives, which is a further input of the model.
+A map prior is the map of a place from earlier drives. The model reads it as a further input.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gsmap.prior.map_prior import MapPrior
 from gsmap.utils.errors import InputError
 
-if TYPE_CHECKING:  # slow to import
+if TYPE_CHECKING:  # the module is slow to import, so `open_priors` imports it when it is called
     from gsmap.prior.opening import AnyPrior
 
 
@@ -37,19 +37,20 @@ def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> 
         prior module of the model takes the prior of each sample from them.
 
     Raises:
-        ValueError: If the model takes no prior, or a prior does not fit it.
+        ValueError: If the model takes no prior, if a prior does not fit it, if two priors are of
+            one place, or if ``update`` is set and the model writes to no prior.
     """
     require_prior(model)
     return model.prior.maps_of(priors, update=update)
 
 
 def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
-    """Let a model read files of priors while it is tested, without changing the files.
+    """Let a model read files of priors in all later tests, without changing the files.
 
     Args:
         model: A `MapDetector`.
         paths: The files, one for each place.
-        stack: Context that closes the priors at its end.
+        stack: Context that closes the priors at its end. The model must not read them later.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -65,17 +66,21 @@ def open_priors(
     """Open files of priors until the end of a context.
 
     Args:
-        model: A `MapDetector` with a prior module. A new file gets the classes and the cells of the
-            model, and its rule for writing predictions.
+        model: A `MapDetector`, which must take a prior. A new file gets the classes and the cells
+            of the model, and its rule for writing predictions.
         paths: The files.
         stack: Context that closes the priors at its end.
         update: Whether to reserve the files, so that they can be saved later. A file that does not
             exist is then created.
         new_place: Name of the place of a file that is created.
 
+    Returns:
+        The priors in the order of ``paths``; open until the end of ``stack``.
+
     Raises:
         FileNotFoundError: If a file does not exist and is not to be updated.
-        ValueError: If a file is no valid prior.
+        ValueError: If the model takes no prior, if a file is no valid prior, or if a file is to be
+            created and the model writes to no prior.
         RuntimeError: If a file is reserved by another process.
     """
     from gsmap.prior.opening import open_prior
@@ -84,8 +89,8 @@ def open_priors(
     priors: list[AnyPrior] = []
     for path in paths:
         if update and not path.exists():
-            with model.prior.new_prior(new_place) as empty:
-                empty.save(path)
+            with model.prior.new_prior(new_place) as empty_prior:
+                empty_prior.save(path)
         prior = open_prior(path, update=update)
         if isinstance(prior, MapPrior):  # priors of other types keep no file open
             stack.enter_context(prior)

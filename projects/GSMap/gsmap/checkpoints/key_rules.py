@@ -1,6 +1,7 @@
 """Rules that rename the state keys of upstream code to the keys of this project, and back.
 
-"Upstream" is the code that the authors of a model published.
+"Upstream" is the code that the authors of a model published. A state key is the name of a tensor in
+the weights of a model, such as ``img_backbone.conv1.weight``.
 """
 
 import re
@@ -10,8 +11,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-_NUMBER = "{i}"
-Rules = tuple[tuple[str, str], ...]
+_NUMBER = "{i}"  # placeholder of a number in a key prefix
+Rules = tuple[tuple[str, str], ...]  # pairs of key prefixes, (upstream, here)
 
 
 @dataclass(frozen=True)
@@ -23,13 +24,14 @@ class KeyMap:
         rules: Key prefixes in pairs (upstream, here). ``{i}`` stands for a number; the numbers
             of both sides are equal and in equal order. The first rule that matches is applied.
         unused: Upstream keys without a counterpart here, with the values that conversion to
-            upstream's format writes; None for a key that only some upstream models have. These keys
-            take precedence over ``rules``.
-        markers: Key prefixes in pairs (upstream, here). If all of them are present, the keys
-            belong to this architecture, not to one that it is built on. The empty prefix of
+            upstream's format writes. The value None means that only some upstream models have the
+            key, so it is not written. These keys take precedence over ``rules``.
+        markers: Key prefixes in pairs (upstream, here). If a key with each prefix is present, the
+            keys belong to this architecture, not to one that it is built on. The empty prefix of
             the default is present in every key.
-        ignored_pattern: Regular expression of further upstream keys without a counterpart, which
-            conversion back leaves out. The default matches nothing.
+        ignored_pattern: Regular expression for the start of further upstream keys without a
+            counterpart. Conversion to upstream's format does not write them. The default matches
+            nothing.
         upstream_prefix: Prefix that only keys in upstream's format have. It identifies the format.
     """
 
@@ -41,7 +43,7 @@ class KeyMap:
     upstream_prefix: str = "pts_bbox_head."
 
     def is_marked(self, keys: Collection[str], upstream: bool) -> bool:
-        """Whether state keys contain all markers of this architecture.
+        """Whether each marker of this architecture is the prefix of a state key.
 
         Args:
             keys: State keys.
@@ -62,7 +64,7 @@ class KeyMap:
         return None if self.is_unused(key) else _rename(key, rules=self.rules)
 
     def to_upstream(self, key: str) -> str | None:
-        """Upstream key for a key of this project, or None if it has no counterpart."""
+        """Upstream key for a key of this project, or None if no rule matches."""
         reversed_rules = tuple((ours, upstream) for upstream, ours in self.rules)
         return _rename(key, rules=reversed_rules)
 
@@ -74,13 +76,14 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 def _rename(key: str, rules: Rules) -> str | None:
-    """Replace the prefix of a key by the first rule that matches."""
-    for source, target in rules:
-        match = _pattern(source).match(key)
+    """Replace the prefix of a key by the first rule that matches; None if no rule matches."""
+    for old_prefix, new_template in rules:
+        match = _pattern(old_prefix).match(key)
         if match is not None:
+            new_prefix = new_template
             for number in match.groups():
-                target = target.replace(_NUMBER, number, 1)
-            return target + key[match.end() :]
+                new_prefix = new_prefix.replace(_NUMBER, number, 1)
+            return new_prefix + key[match.end() :]
     return None
 
 
@@ -90,12 +93,15 @@ def rules_of(upstream: str, ours: str, names: str) -> Rules:
     Args:
         upstream: Prefix of upstream's keys.
         ours: Prefix of the keys of this project.
-        names: Remainders of the keys, separated by blanks. Each is ``theirs=ours``, or one name if
-            both are equal.
+        names: Continuations of both prefixes, separated by blanks. Each is ``theirs=ours``, or one
+            name if both are equal. A continuation may itself be the prefix of several keys.
+
+    Returns:
+        Pairs of key prefixes (upstream, here), in the order of ``names``.
     """
     rules: list[tuple[str, str]] = []
     for name in names.split():
-        their_name, _, our_name = name.partition("=")
+        their_name, _, our_name = name.partition("=")  # `our_name` is empty without "="
         rules.append((upstream + their_name, ours + (our_name or their_name)))
     return tuple(rules)
 
@@ -108,5 +114,8 @@ def zeros(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tenso
     Args:
         prefix: Prefix of the keys.
         shapes: Shapes by the remainder of the key.
+
+    Returns:
+        Tensors by complete key, for ``KeyMap.unused``. They must not be changed in place.
     """
     return {prefix + key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}

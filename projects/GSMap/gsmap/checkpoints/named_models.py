@@ -26,7 +26,7 @@ class NamedModel:
     Attributes:
         name: Name of the model.
         config: Path of the config in the repository.
-        sha256: SHA-256 digest of the weights' file; None if it is unknown.
+        sha256: SHA-256 digest of the weights' file, hexadecimal; None if it is unknown.
         source: Authors of the weights, or address of their project.
         licence: Licence of the weights.
         address: Download address of the weights; None for models that ship.
@@ -48,13 +48,13 @@ class NamedModel:
 
     @property
     def file(self) -> Path:
-        """File of the weights."""
+        """File of the weights, which may be missing if the model does not ship."""
         return shipped_path(f"models/{self.name}.pth")
 
 
 @cache
 def named_models() -> dict[str, NamedModel]:
-    """Models of the registry by name."""
+    """Models of the registry by name, whether or not their weights are available."""
     models: dict[str, NamedModel] = {}
     for row in read_json(shipped_path("models/registry.json")):
         models[row["name"]] = NamedModel(**row)
@@ -68,7 +68,10 @@ def list_models() -> list[str]:
 
 @cache
 def named_configs() -> dict[str, Path]:
-    """Files of the shipped configs by name (the file name without suffix); no base configs."""
+    """Files of the shipped configs by name (the file name without suffix); no base configs.
+
+    Base configs lie in folders whose names start with an underscore.
+    """
     configs: dict[str, Path] = {}
     for pattern in ("configs/*.py", "configs/[!_]*/*.py", "projects/GSMap/configs/*.py"):
         for path in sorted(shipped_path().glob(pattern)):
@@ -81,6 +84,7 @@ def find_config(config: str | Path) -> Path:
 
     Args:
         config: Path of the file, path in the repository, name of the config, or name of a model.
+            They are tried in this order.
 
     Raises:
         FileNotFoundError: If there is no such config; the message contains the nearest name.
@@ -90,10 +94,11 @@ def find_config(config: str | Path) -> Path:
         if path.is_file():
             return path
     configs = named_configs()
+    # The names are cached, so the file may have been removed since they were listed.
     if name in configs and configs[name].is_file():
         return configs[name]
-    places = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped_path()}"
-    model = _find_model(config, kind="config file", message_end=places, other_names=configs)
+    message_end = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped_path()}"
+    model = _find_model(config, kind="config file", message_end=message_end, other_names=configs)
     return shipped_path(model.config)
 
 
@@ -136,7 +141,10 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
 
 @cache
 def _warn_unverified(name: str) -> None:
-    """Warn once that a model's file cannot be verified without a digest."""
+    """Warn that a model's file cannot be verified without a digest.
+
+    The cache limits this to one warning for each model.
+    """
     model = named_models()[name]
     print_log(
         f"{model.file} is not verified: {model.source} gives no sha256 for {model.name}; the "
@@ -154,8 +162,9 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
             model that ``config`` names.
 
     Raises:
-        FileNotFoundError: If the checkpoint does not exist.
-        ValueError: If ``checkpoint`` is None and ``config`` refers to a config, but not to a model.
+        FileNotFoundError: If the checkpoint or the named model does not exist.
+        ValueError: If ``checkpoint`` is None and ``config`` refers to a config, but not to a model;
+            or if the digest of a model's file differs from the registry.
     """
     if checkpoint is not None:
         return find_checkpoint(checkpoint)
@@ -185,9 +194,11 @@ def _find_model(
     models = named_models()
     if str(name) not in models:
         candidates = [*models, *other_names]
-        close = difflib.get_close_matches(Path(name).stem, candidates, n=1, cutoff=0.7)
+        close_names = difflib.get_close_matches(Path(name).stem, candidates, n=1, cutoff=0.7)
         shipped_names = ", ".join(model.name for model in models.values() if not model.address)
-        hint = f"did you mean {close[0]}?" if close else f"the shipped models are {shipped_names}"
+        hint = f"the shipped models are {shipped_names}"
+        if close_names:
+            hint = f"did you mean {close_names[0]}?"
         raise FileNotFoundError(
             f"There is no {kind} {name}, and no model of that name ({hint}){message_end}."
         )

@@ -1,4 +1,9 @@
-"""Conversion of map annotations and predictions to ``MapElements``."""
+"""Conversion of map annotations and predictions to ``MapElements``.
+
+A sample has K ground truths or N predictions. Points are in metres in the annotation frame, and
+labels are indices of classes. For targets and predictions, ``instances`` is mmengine's
+``InstanceData``, or a mapping with equal keys.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,13 +17,14 @@ from gsmap.structures.elements import MapElements
 
 def _array(values: Any) -> npt.NDArray[Any]:
     """Convert a tensor on any device, or an array-like, to an array."""
+    # Only tensors have this method. The test needs no import of torch.
     if hasattr(values, "detach"):
         values = values.detach().cpu()
     return np.asarray(values)
 
 
 def _polylines(instances: Any) -> Any:
-    """Return ``pts`` (N, P, 2), or a list of lines cut to ``num_pts`` points if this key exists."""
+    """Return ``pts`` (N, P, 2), or a list of lines without padding if ``num_pts`` exists."""
     points = _array(instances["pts"])
     if "num_pts" not in instances:
         return points
@@ -29,7 +35,7 @@ def _polylines(instances: Any) -> Any:
 
 
 def elements_of_instances(instances: Sequence[MapInstance]) -> MapElements:
-    """Convert the ``instances`` of an annotation record to map elements."""
+    """Convert the ``instances`` of a sample in an annotation file to map elements."""
     polylines = []
     labels = []
     for instance in instances:
@@ -43,6 +49,9 @@ def elements_of_truth(info: Mapping[str, Any]) -> MapElements:
 
     Args:
         info: ``polylines`` in metres in the annotation frame, K x (n, 2 or 3), and ``labels`` (K,).
+
+    Raises:
+        ValueError: If a point is not finite (raised by `MapElements`).
     """
     polylines = [_array(polyline) for polyline in info["polylines"]]
     return MapElements.from_polylines(polylines, labels=info["labels"])
@@ -52,7 +61,8 @@ def elements_of_targets(instances: Any) -> MapElements:
     """Convert the training targets of a sample, ``gt_instances_3d``, to map elements.
 
     Args:
-        instances: ``pts`` in metres in the annotation frame (K, P, 2) and ``labels_3d`` (K,).
+        instances: ``pts`` in metres in the annotation frame (K, P, 2) and ``labels_3d`` (K,). If
+            the elements have different numbers of points, also ``num_pts`` (K,).
     """
     labels = _array(instances["labels_3d"])
     return MapElements.from_polylines(_polylines(instances), labels=labels)
@@ -63,14 +73,16 @@ def elements_of_predictions(instances: Any) -> MapElements:
 
     Args:
         instances: ``pts`` in metres in the annotation frame (N, P, 2), ``labels_3d`` (N,) and
-            ``scores_3d`` (N,). If the elements have different numbers of points, also ``num_pts``
-            (N,). If the model predicts Gaussians, also ``scales`` in metres (N, P, 2) and
-            ``rotations`` in radians (N, P).
+            ``scores_3d`` in [0, 1] (N,). If the elements have different numbers of points, also
+            ``num_pts`` (N,), after which ``pts`` are padding. If the model predicts Gaussians, also
+            their standard deviations ``scales`` in metres (N, P, 2) and the angles ``rotations`` of
+            their first axes from +x in radians (N, P).
 
     Raises:
-        ValueError: If a point or a score is not finite (raised by `MapElements`).
+        ValueError: If a point or a rotation is not finite, a score is not in [0, 1], or a scale is
+            not positive and finite (raised by `MapElements`).
     """
-    gaussians = {}
+    gaussians = {}  # arguments of `from_polylines`; empty without Gaussians
     for key in ("scales", "rotations"):
         if key in instances:
             gaussians[key] = _array(instances[key])

@@ -15,18 +15,21 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import fetch_advice
 
-# The import registers the formats in pillow; no other format is opened.
+# The imports register the formats in pillow, and this tuple keeps the imports. No other format is
+# opened.
 _PLUGINS = (JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin)
 FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
-# First bytes of a file by format.
+# Format of a file by its first bytes.
 _STARTS = {b"\xff\xd8": "jpeg", b"\x89PNG": "png", b"RIFF": "webp", b"BM": "bmp"}
 _JPEG_START = b"\xff\xd8"
 _ORIENTATION_ENTRIES = (b"Exif\0\0", b"tiff:Orientation")  # EXIF and XMP may have an orientation
 _ORIENTATION_TAG = 0x0112  # EXIF tag of the orientation
 _ROTATIONS = range(2, 9)  # orientations that need a rotation: 1 is upright, 0 is not set
 _MAX_PIXELS = 10**8  # a decoder allocates memory for the size in the header, whatever follows
-_MAX_JPEG_SCANS = 100  # each scan may take as much time as a whole image
-_SCAN = b"\xff\xda"
+# A progressive JPEG has several scans, each of which refines the image. A damaged or malicious file
+# may have thousands, and each scan may take as much time as a whole image.
+_MAX_JPEG_SCANS = 100
+_SCAN = b"\xff\xda"  # marker at the start of a scan
 _MIN_BRIGHTEST = 1 << 14  # if all values of a 16-bit file are smaller, the image has <= 14 bits
 # Errors of pillow and simplejpeg for damaged files.
 _DAMAGE = (
@@ -45,7 +48,7 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
 
     Args:
         file: Image file.
-        where: Sample and camera, with which messages begin.
+        where: Beginning of messages, such as the sample and the camera.
 
     Returns:
         Width and height in pixels.
@@ -53,6 +56,7 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If the file is not an image, or has too many pixels.
+        OSError: If the file cannot be read, such as after a failure of the disk.
     """
     if not file.is_file():
         raise FileNotFoundError(f"{where}: no image at {file}; {_why_missing(file)}.")
@@ -65,7 +69,9 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
         except _UnfitError as error:
             raise InputError(f"{where}: {file} cannot be used: {error}.") from error
         except _DAMAGE as error:
-            if getattr(error, "errno", None):  # the disk failed: pillow's errors have no number
+            # Errors of the system, such as a failed disk, have an error number (errno). Errors of
+            # pillow about the content have none.
+            if getattr(error, "errno", None):
                 raise
             raise InputError(_no_image(where, path=file, content=start)) from error
 
@@ -77,15 +83,15 @@ def read_image(
 
     Args:
         path: Image file. An image in memory, BGR (H, W, 3), is returned without a check.
-        where: Sample and camera, with which messages begin.
+        where: Beginning of messages, such as the sample and the camera.
         size: Expected width and height in pixels; None for any size.
 
     Returns:
         Image, BGR, uint8. (H, W, 3)
 
     Raises:
-        BrokenSampleError: If the file is missing, damaged or not an image, if the image has another
-            size, or if its EXIF orientation needs a rotation.
+        BrokenSampleError: If the file is missing, or if `decode_image` rejects its content. The
+            error is a ``ValueError``.
     """
     if isinstance(path, np.ndarray):
         return path
@@ -100,8 +106,8 @@ def decode_image(
 ) -> np.ndarray:
     """Decode and check the content of an image file.
 
-    A warning of the JPEG decoder is raised as an error. OpenCV would fill missing parts with grey
-    without a message.
+    JPEG files are decoded by simplejpeg, which raises the warnings of its decoder as errors. OpenCV
+    is not used for them, because it would fill missing parts with grey without a message.
 
     Args:
         content: Content of the file.
@@ -113,8 +119,10 @@ def decode_image(
         Image, BGR, uint8. (H, W, 3)
 
     Raises:
-        BrokenSampleError: If the content is damaged or not an image, if the image has another size,
-            or if its EXIF orientation needs a rotation.
+        BrokenSampleError: If the content is damaged or not an image, if the image has another size
+            or more than 100 million pixels, if its EXIF orientation needs a rotation, if it is an
+            animation, if a JPEG has more than 100 scans, or if a 16-bit image would be almost black
+            in 8 bits. The error is a ``ValueError``.
     """
     if _image_format(content) is None:
         raise BrokenSampleError(_no_image(where, path=path, content=content))
@@ -129,6 +137,8 @@ def decode_image(
         raise BrokenSampleError(
             f"{where}: {path} is truncated or damaged ({error}); copy it again."
         ) from error
+    # The functions above return no pixels if the size is wrong. "Its record" in the message is the
+    # entry of the camera in the annotation file, which has the expected size.
     if image is None:
         raise BrokenSampleError(
             f"{where}: {path} has {width} x {height} pixels, but its record and its calibration "
@@ -146,7 +156,8 @@ def image_content(file: Path, where: str, size: tuple[int, int]) -> tuple[bytes,
         size: Expected width and height in pixels.
 
     Returns:
-        Content and format: ``jpeg``, ``png`` or ``webp``. A BMP image is encoded as JPEG.
+        Content and format: ``jpeg``, ``png`` or ``webp``. A BMP image, which viewers of the copies
+        may not support, is encoded as JPEG.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -154,6 +165,7 @@ def image_content(file: Path, where: str, size: tuple[int, int]) -> tuple[bytes,
     """
     content = file.read_bytes()
     image = decode_image(content, str(file), where=where, size=size)
+    # `decode_image` rejects unknown formats, so `or ""` is only for the type checker.
     image_format = _image_format(content) or ""
     if image_format == "bmp":
         return encode_jpeg(image, quality=95), "jpeg"
@@ -198,7 +210,8 @@ def _why_missing(file: Path) -> str:
 
 
 def _no_image(where: str, path: object, content: bytes) -> str:
-    """Return the message about a file that is not an image."""
+    """Return the message about a file that is not an image, for its content or first bytes."""
+    # Another advice is returned if the content is a web page or a pointer of Git LFS.
     advice = fetch_advice(content, "copy it again, or convert it to one of these")
     return f"{where}: {path} is not an image (JPEG, PNG, WebP or BMP); {advice}."
 
@@ -207,6 +220,7 @@ def _decode_jpeg(
     content: bytes, size: tuple[int, int] | None
 ) -> tuple[tuple[int, int], np.ndarray | None]:
     """Return (width, height) and BGR pixels of a JPEG; no pixels (None) if ``size`` differs."""
+    # The orientation is read by pillow. This takes time, so it is done only if there may be one.
     if any(entry in content for entry in _ORIENTATION_ENTRIES):
         with Image.open(BytesIO(content), formats=FORMATS) as picture:
             _require_upright(picture)
@@ -223,7 +237,10 @@ def _decode_jpeg(
 def _decode_other(
     content: bytes, size: tuple[int, int] | None
 ) -> tuple[tuple[int, int], np.ndarray | None]:
-    """Return (width, height) and BGR pixels of an image; no pixels (None) if ``size`` differs."""
+    """Return (width, height) and BGR pixels of a PNG, WebP or BMP image.
+
+    There are no pixels (None) if ``size`` differs.
+    """
     with Image.open(BytesIO(content), formats=FORMATS) as picture:
         if size not in (None, picture.size):
             return picture.size, None
@@ -233,14 +250,17 @@ def _decode_other(
             raise _UnfitError(f"it is an animation of {num_frames} images: save each as a file")
         has_16_bits = False
         if picture.tile:
-            # The first block of pixel data; its last field has the raw mode, such as "RGB;16B".
+            # The first block of pixel data. Its last field has the raw mode, the type of the stored
+            # values, such as "RGB;16B" for 16 bits.
             _, _, _, decoder_arguments = picture.tile[0]
             has_16_bits = ";16" in str(decoder_arguments)
         picture.load()  # the orientation of a PNG may follow the pixels
         _require_upright(picture)
-        if picture.mode.startswith("I"):
+        if picture.mode.startswith("I"):  # grey with 16 bits
             return picture.size, _bgr_from_16_bit_grey(np.asarray(picture))
         if has_16_bits:
+            # Pillow has reduced the colours to 8 bits. OpenCV decodes them once more with 16 bits,
+            # so that their largest value can be checked.
             encoded = np.frombuffer(content, dtype=np.uint8)
             _require_bright(cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED))
         rgb = np.asarray(picture.convert("RGB"))
@@ -269,8 +289,9 @@ def _require_upright(picture: Image.Image) -> None:
 
 def _require_bright(values: np.ndarray) -> None:
     """Raise an error for 16-bit values that are nearly black in 8 bits. (H, W[, 3 or 4])"""
-    colours = values[..., :3] if values.ndim == 3 else values
+    colours = values[..., :3] if values.ndim == 3 else values  # without the opacity
     brightest = int(colours.max())
+    # An image that is black throughout (0) is accepted.
     if 0 < brightest < _MIN_BRIGHTEST:
         raise _UnfitError(
             f"its largest value is {brightest} of 65535, as in a depth map or an image of a camera "
@@ -282,5 +303,6 @@ def _require_bright(values: np.ndarray) -> None:
 def _bgr_from_16_bit_grey(grey: np.ndarray) -> np.ndarray:
     """Convert 16-bit grey values to 8-bit BGR. (H, W) -> (H, W, 3)"""
     _require_bright(grey)
+    # Pillow may return 16-bit values as wider integers, so the result is limited to 8 bits.
     grey_8_bit = (grey >> 8).clip(0, 255).astype(np.uint8)
     return cv2.cvtColor(grey_8_bit, cv2.COLOR_GRAY2BGR)

@@ -1,4 +1,7 @@
-"""Shared command-line arguments. The module does not import torch, which keeps ``--help`` fast."""
+"""Shared command-line arguments.
+
+Neither this module nor ``mmengine.config`` imports torch, which keeps ``--help`` fast.
+"""
 
 import argparse
 from collections.abc import Sequence
@@ -17,22 +20,27 @@ def data_root_options(data_root: str | Path) -> dict[str, str]:
 class _OptionAction(argparse.Action):
     """Store ``--data-root`` or ``--image-scale`` and add it to the config overrides.
 
-    Overrides from ``--cfg-options`` take precedence.
+    Overrides from ``--cfg-options`` take precedence, in any order of the options. If they come
+    first, this action keeps them. If they come later, their action (``DictAction``) extends the
+    overrides and replaces the values of equal keys.
     """
 
     def __call__(
         self, parser: object, namespace: argparse.Namespace, values: Any, option: object = None
     ) -> None:
         setattr(namespace, self.dest, values)
-        overrides = {self.dest: values}
+        overrides = {self.dest: values}  # `read_config` scales all images by ``image_scale``
         if self.dest == "data_root":
             overrides = data_root_options(values)
-        explicit_overrides = getattr(namespace, "cfg_options", None) or {}
-        namespace.cfg_options = {**overrides, **explicit_overrides}
+        earlier_overrides = getattr(namespace, "cfg_options", None) or {}
+        namespace.cfg_options = {**overrides, **earlier_overrides}
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that override config settings. The parser stores them in ``cfg_options``."""
+    """Add the options that override config settings.
+
+    The parser stores all overrides, by dotted name, in ``cfg_options``. It is None without any.
+    """
     parser.add_argument(
         "--data-root",
         type=Path,
@@ -57,14 +65,22 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_options(words: Sequence[str]) -> dict[str, Any]:
-    """Parse overrides of the form ``KEY=VALUE`` as ``--cfg-options`` does."""
+    """Parse overrides of the form ``KEY=VALUE`` as ``--cfg-options`` does.
+
+    Returns:
+        Value of each setting, by its dotted name.
+    """
     parser = argparse.ArgumentParser()
     add_config_options(parser)
     return parser.parse_args(["--cfg-options", *words]).cfg_options
 
 
 def add_common_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every OpenMMLab tool has."""
+    """Add the options of training and testing.
+
+    These are options that OpenMMLab's tools have, too, and `add_config_options`. PyTorch's launcher
+    passes ``--local_rank``, the number of the process on its machine.
+    """
     parser.add_argument("--work-dir", help="folder for logs, checkpoints and pictures")
     add_config_options(parser)
     parser.add_argument("--launcher", choices=["none", "pytorch", "slurm", "mpi"], default="none")

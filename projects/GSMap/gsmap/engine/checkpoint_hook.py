@@ -63,9 +63,15 @@ def _metainfo(loader: Any) -> dict[str, Any]:
 
 
 def _pass_model_facts(loop: Any, path: Path, meta: dict[str, Any]) -> None:
-    """Add the checkpoint's digest and calibration to the metadata of the result files."""
+    """Add the checkpoint's digest and calibration to the metadata of the result files.
+
+    Args:
+        loop: Test loop, whose evaluator writes the result files.
+        path: File or address of the checkpoint.
+        meta: Metadata of the checkpoint; untrusted.
+    """
     facts: dict[str, Any] = {CALIBRATION: calibration_of(meta)}
-    if path.is_file():  # not an address
+    if path.is_file():  # there is no digest of an address
         facts[CHECKPOINT] = digest(path)
     loop.evaluator.dataset_meta = {**(loop.evaluator.dataset_meta or {}), **facts}
 
@@ -103,6 +109,8 @@ class AtomicCheckpointHook(CheckpointHook):
 
     def before_run(self, runner: Runner) -> None:
         """Register the safe checkpoint loaders; mmengine loads a checkpoint after this call."""
+        # mmengine's loader of web addresses calls `load_url`. The loaders of torchvision's weights
+        # and of local paths (the empty scheme) are replaced in the registry.
         mmengine_checkpoint.load_url = load_published
         CheckpointLoader.register_scheme(
             ("torchvision://", "modelzoo://"), loader=load_from_torchvision, force=True
@@ -119,14 +127,14 @@ class AtomicCheckpointHook(CheckpointHook):
         validation and test loops, and its calibration to the test loop.
 
         Raises:
-            ValueError: If the run cannot be resumed from the checkpoint, or if the checkpoint was
-                trained on another split.
+            ValueError: If the run cannot be resumed from the checkpoint, if the checkpoint has no
+                usable weights, if its metadata are invalid, or if it was trained on another split.
         """
-        source = runner._load_from
+        source = runner._load_from  # file or address of the checkpoint
         if runner._resume:
             check_resumable(checkpoint, runner=runner, path=source)
         with refusing(source):  # errors name the source and a remedy
-            state = unwrap(checkpoint).state
+            state = unwrap(checkpoint).state  # weights, with the keys of an unwrapped model
         # Other training loops store the weights elsewhere, or below a prefix.
         if state.keys() != checkpoint.get("state_dict", {}).keys():
             checkpoint["state_dict"] = state
@@ -136,14 +144,16 @@ class AtomicCheckpointHook(CheckpointHook):
         meta.pop("config", None)
         if "optimizer" in checkpoint and runner._resume:
             wrapper = runner.optim_wrapper
+            # The check needs the parameter groups of this run, so it follows the conversion.
             fit_optimizer_state(checkpoint, wrapper=wrapper)
-            if isinstance(wrapper, OptimWrapper):
-                with refusing_state(source):
+            if isinstance(wrapper, OptimWrapper):  # a dict of wrappers has several optimizers
+                with refusing_state(source):  # a malformed state becomes a ValueError
                     check_optimizer_state(
                         checkpoint["optimizer"], optimizer=wrapper.optimizer, path=source
                     )
         trained_meta = meta.get("dataset_meta")
         if isinstance(trained_meta, dict):
+            # A loop is None if the run does not have it, or a dict if mmengine has not built it.
             for loop in (runner._val_loop, runner._test_loop):
                 if isinstance(loop, BaseLoop):
                     self._check_split(trained_meta, loop=loop)
@@ -164,15 +174,18 @@ class AtomicCheckpointHook(CheckpointHook):
                 f"weights are NaN or infinite ({summarize_names(nonfinite_keys)}), so they are not "
                 "saved."
             )
-        settings = plain(runner.cfg.model.to_dict())
+        settings = plain(runner.cfg.model.to_dict())  # JSON types only
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
-        dataset = innermost(runner.train_dataloader.dataset)
+        dataset = innermost(runner.train_dataloader.dataset)  # without wrappers
         if hasattr(dataset, "scaled_image_size"):
             checkpoint["meta"][IMAGE_SIZE] = list(dataset.scaled_image_size())
             checkpoint["meta"][SIGNALS] = dataset.has_signals()
 
     def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
-        """Save a checkpoint; a link in place of `NEWEST` is replaced, not followed."""
+        """Save a checkpoint, and write its path to the file `NEWEST`.
+
+        mmengine would follow a link of this name and overwrite its target, so a link is removed.
+        """
         if runner.rank == 0:
             remove_link(Path(runner.work_dir, NEWEST))
         super()._save_checkpoint_with_step(runner, step=step, meta=meta)
@@ -180,16 +193,20 @@ class AtomicCheckpointHook(CheckpointHook):
     def _check_split(self, trained_meta: dict[str, Any], loop: Any) -> None:
         """Require that evaluation data come from the training's split, and record it for results.
 
-        If the data sets differ, nothing is checked or recorded.
+        If the data sets differ, nothing is checked or recorded. An unknown split is accepted.
 
         Args:
-            trained_meta: Metadata of the training's data set.
+            trained_meta: Metadata of the training's data set; untrusted if from a checkpoint.
             loop: Validation or test loop.
+
+        Raises:
+            ValueError: If both splits are known and differ, unless ``allow_other_split`` is set, or
+                if the identity of a split is malformed.
         """
         scored_meta = _metainfo(loop.dataloader)
         if trained_meta.get("dataset") != scored_meta.get("dataset"):
             return
-        identity = checked_identity(trained_meta.get(SPLIT_LIST))
+        identity = checked_identity(trained_meta.get(SPLIT_LIST))  # empty if unknown
         if not self.allow_other_split:
             require_same_list(
                 model=identity,
@@ -200,8 +217,12 @@ class AtomicCheckpointHook(CheckpointHook):
         loop.evaluator.dataset_meta = scored_meta | {TRAINED_ON: identity}
 
     def before_train(self, runner: Runner) -> None:
-        """Prepare the training, and run a validation that was due when the run was interrupted."""
-        super().before_train(runner)
+        """Prepare the training, and run a validation that was due when the run was interrupted.
+
+        Raises:
+            ValueError: If the validation data are from another split than the training data.
+        """
+        super().before_train(runner)  # restores the paths of the best checkpoints when resuming
         self._forget_foreign_best(runner)
         if isinstance(runner.val_loop, BaseLoop):
             self._check_split(_metainfo(runner.train_dataloader), loop=runner.val_loop)
@@ -212,6 +233,8 @@ class AtomicCheckpointHook(CheckpointHook):
         else:
             progress = loop.iter
             end = loop.max_iters
+        # mmengine's conditions for a validation, applied to the progress at which the run stopped.
+        # Progress 0 is a new run.
         has_begun = progress >= max(loop.val_begin, 1)
         is_at_interval = progress % loop.val_interval == 0 or progress == end
         is_due = has_begun and is_at_interval
@@ -224,6 +247,8 @@ class AtomicCheckpointHook(CheckpointHook):
     def _forget_foreign_best(self, runner: Runner) -> None:
         """Forget best checkpoints outside of the run's folder, which mmengine might delete."""
         folder = Path(self.out_dir).resolve()
+        # mmengine has `best_ckpt_path` for one metric in `save_best` and `best_ckpt_path_dict` for
+        # several ones. Without `save_best` there may be neither.
         if self._is_foreign(getattr(self, "best_ckpt_path", None), folder=folder):
             self.best_ckpt_path = None
         paths = getattr(self, "best_ckpt_path_dict", {})
@@ -238,9 +263,9 @@ class AtomicCheckpointHook(CheckpointHook):
             return False
         if not isinstance(path, str):
             return True
-        place = Path(path)
-        is_best = re.fullmatch(r"best_.+_\d+\.pth", place.name)
-        return not is_best or place.is_symlink() or place.resolve().parent != folder
+        best_path = Path(path)
+        has_best_name = re.fullmatch(r"best_.+_\d+\.pth", best_path.name)
+        return not has_best_name or best_path.is_symlink() or best_path.resolve().parent != folder
 
     def after_val_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
         """Save the best checkpoint, and record the validated iteration.
@@ -248,7 +273,7 @@ class AtomicCheckpointHook(CheckpointHook):
         Raises:
             ValueError: If the validation lacks the metric that ``save_best`` names.
         """
-        for name in getattr(self, "key_indicators", ()):
+        for name in getattr(self, "key_indicators", ()):  # metrics in `save_best`, if it is set
             if metrics and name not in metrics:
                 mean_names = [metric for metric in metrics if metric.endswith("/mAP")]
                 raise InputError(

@@ -5,7 +5,7 @@ from mmengine.config import Config
 from gsmap.utils.errors import InputError
 
 LOG_LINES = 10  # number of times that a run logs its losses
-WARM_UP = 20  # iterations
+WARM_UP = 20  # number of iterations in which the learning rate rises
 
 
 def overfit(cfg: Config, samples: int, iterations: int) -> None:
@@ -39,15 +39,16 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
             f"--overfit takes samples one by one, but train_dataloader.sampler of {cfg.filename} "
             f"is a {sampler}: take a config of a model without memory."
         )
+    # This sampler repeats the samples without end, which suits a training that counts iterations.
     loader.sampler = {"type": "InfiniteSampler", "shuffle": True}
     loader.dataset.indices = samples  # for mmengine, a number selects the first samples
     loader.batch_size = min(loader.batch_size, samples)
-    loader.num_workers = 0
-    loader.persistent_workers = False
+    loader.num_workers = 0  # a few samples are loaded in the process of the training
+    loader.persistent_workers = False  # not allowed without workers
     cfg.train_cfg = {
         "type": "IterBasedTrainLoop",
         "max_iters": iterations,
-        "val_interval": iterations + 1,
+        "val_interval": iterations + 1,  # after the end, so there is no validation
     }
     cfg.val_cfg = None
     cfg.val_dataloader = None
@@ -60,7 +61,7 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
     hooks.logger = {"type": "LoggerHook", "interval": interval}
     hooks.checkpoint.interval = iterations
     hooks.checkpoint.by_epoch = False
-    hooks.checkpoint.save_best = None
+    hooks.checkpoint.save_best = None  # there is no validation to compare
     hooks.visualization.draw = False
     cfg.log_processor.by_epoch = False
-    cfg.log_processor.window_size = interval
+    cfg.log_processor.window_size = interval  # each log line has the mean since the previous one

@@ -30,7 +30,8 @@ class GaussianMetric(BaseMetric):
     """Metric of the soft IoU of predicted and true masks, and of the sizes of the Gaussians.
 
     Predictions of a class are assigned to its ground truths by the soft IoU of their masks. Only
-    predictions with a score of 0.3 or more count. A model without Gaussians has no figures.
+    predictions with a score of 0.3 or more count. A model without Gaussians has no figures. The
+    sizes of a Gaussian are its standard deviations along and across the line.
     """
 
     default_prefix = "gaussians"
@@ -42,11 +43,13 @@ class GaussianMetric(BaseMetric):
             data_batch: Not used.
             data_samples: Samples with ``token``, ``x_range`` and ``y_range`` in metres,
                 ``eval_ann_info`` and ``pred_instances_3d`` (docs/architecture.md).
-                ``pred_instances_3d`` contains ``min_scale_m``, the lower bound of sizes in metres.
+                ``pred_instances_3d`` contains ``scores_3d``, ``labels_3d``, ``pts`` and, for a
+                model with Gaussians, ``scales``, ``rotations`` and ``min_scale_m``, the lower bound
+                of sizes in metres.
         """
         for sample in data_samples:
             has_gaussians = "scales" in sample["pred_instances_3d"]
-            measurement = None
+            measurement = None  # for a sample without annotations, or a model without Gaussians
             if sample.get("eval_ann_info") and has_gaussians:
                 measurement = self._measure(sample)
             self.results.append((sample["token"], measurement))
@@ -58,7 +61,7 @@ class GaussianMetric(BaseMetric):
             Whether each Gaussian of the sample is at the lower bound of sizes (n,), and a dict by
             label. Its values are two arrays: the soft IoU of each matched pair of the class
             (m,), and the sizes in metres of each Gaussian of the class, along and across the line
-            (k, 2).
+            (k, 2). Predictions below `SCORE_THRESHOLD` are left out.
         """
         predictions = sample["pred_instances_3d"]
         truth = sample["eval_ann_info"]
@@ -98,22 +101,24 @@ class GaussianMetric(BaseMetric):
             vertices = torch.from_numpy(line[None, :, :2].astype(np.float32))
             gt_masks.append(draw_polylines(vertices, grid, width_m=LINE_WIDTH_M))
         iou = pairwise_soft_iou(masks, torch.cat(gt_masks)).numpy()
-        pred_index, gt_index = linear_sum_assignment(-iou)
+        pred_index, gt_index = linear_sum_assignment(-iou)  # negative, as it minimises the sum
         return iou[pred_index, gt_index]
 
     def compute_metrics(self, results: list[tuple[str, Any]]) -> dict[str, float]:
         """Compute the figures of all samples and log them as a table.
 
         Args:
-            results: Token and measurement of each sample.
+            results: Token of each sample, and the value of `_measure` or None.
 
         Returns:
-            ``soft_iou/<name>``, ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians in
-            metres) of each class, and ``at_floor``, the share of Gaussians at the lower bound of
-            sizes; empty without Gaussians.
+            ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians
+            in metres) of each class for which they are defined, and ``at_floor``, the share of
+            Gaussians at the lower bound of sizes; empty without Gaussians.
         """
         floors = []
         class_figures = []
+        # The dict keeps one of several results of a sample. Sorting makes the order of the samples
+        # independent of the processes that measured them.
         for _, measurement in sorted(dict(results).items()):
             if measurement:
                 floor, figures = measurement
@@ -128,7 +133,7 @@ class GaussianMetric(BaseMetric):
             f"{100 * metrics['at_floor']:.1f} % of them at their smallest size:"
         ]
         for label, name in enumerate(self.dataset_meta["classes"]):
-            ious = [np.empty(0)]
+            ious = [np.empty(0)]  # an empty array, as `concatenate` needs at least one
             sizes = [np.empty((0, 2))]
             for figures in class_figures:
                 if label in figures:

@@ -1,4 +1,4 @@
-"""Settings of a prior of elements."""
+"""Settings of a prior of elements, a map of earlier drives that stores whole map elements."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,8 @@ class ElementRule:
     Args:
         sigma_m: Standard deviation of the points of an element across its line, in [0.01, 5]
             metres.
-        line_width_m: Width with which an element is drawn to the cells of a frame, in [0.05, 5]
-            metres.
+        line_width_m: Width of the lines when elements are drawn to the raster of a frame, in
+            [0.05, 5] metres.
 
     Raises:
         ValueError: If a setting is out of range.

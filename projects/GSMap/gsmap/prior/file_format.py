@@ -2,7 +2,10 @@
 
 The file begins with the magic number, the version and the length of the header, all little-endian.
 The header is JSON in UTF-8. Compressed tiles (zlib) follow, then the index with the column, row,
-offset, length and checksum of each tile. A footer of fixed size ends the file.
+offset, length and checksum (CRC-32) of each tile. A footer of fixed size ends the file.
+
+A rule is an object with the settings by which the states of the prior are updated. Files are
+untrusted: header, index and tiles are checked before their content is used.
 """
 
 import json
@@ -37,7 +40,8 @@ GAUSSIAN_MAGIC = b"\x89GSGAUSS"
 """First bytes of a file of `GaussianPrior`."""
 ELEMENT_MAGIC = b"\x89GSELEMS"
 """First bytes of a file of `ElementPrior`."""
-_START = struct.Struct("<8sII")  # magic, version, length of the header
+# Formats of `struct`: "<" is little-endian, "8s" 8 bytes, "I" and "Q" integers of 4 and 8 bytes.
+_START = struct.Struct("<8sII")  # magic, version, length of the header in bytes
 # Offset, number of rows and checksum of the index; checksum of the header; magic.
 _FOOTER = struct.Struct("<QIII8s")
 _INDEX = np.dtype(
@@ -84,9 +88,10 @@ def save_file(
         magic: First bytes of the kind of file.
 
     Raises:
+        ValueError: If another program has written the lock file.
         RuntimeError: If the file is reserved by another process.
     """
-    owner = reserve_file(path)
+    owner = reserve_file(path)  # open lock file, which reserves `path` until it is closed
     try:
         with atomic_write(path, mode="wb") as file:
             write_tiles(file, settings, rule=rule, tiles=tiles, magic=magic)
@@ -135,8 +140,8 @@ def write_tiles(
         tiles: Column and row, and compressed states, of each tile.
         magic: First bytes of the kind of file.
     """
-    entry = rule_settings(rule, _KINDS[magic].rules)
-    header = json.dumps(asdict(settings) | {"rule": entry}).encode()
+    rule_entry = rule_settings(rule, _KINDS[magic].rules)  # name and numbers of the rule
+    header = json.dumps(asdict(settings) | {"rule": rule_entry}).encode()
     file.write(_START.pack(magic, VERSION, len(header)))
     file.write(header)
     offset = _START.size + len(header)
@@ -168,6 +173,8 @@ def read_header(
     """
     kind = _KINDS[magic]
     size = len(content)
+    # 200 bytes are enough for `fetch_advice`. It recognises a Git LFS pointer or a web page that
+    # was stored in place of the file.
     start = bytes(content[: max(_START.size, 200)])
     if not start.startswith(magic):
         advice = fetch_advice(start, otherwise=f"give a file that {kind.writer}.save has written")
@@ -183,6 +190,7 @@ def read_header(
     footer = _FOOTER.unpack_from(content, size - _FOOTER.size)
     offset, count, index_crc, header_crc, last_bytes = footer
     index_size = count * _INDEX.itemsize
+    # The index lies directly before the footer.
     if last_bytes != magic or offset + index_size + _FOOTER.size != size:
         raise _cut(path)
     header_end = _START.size + length
@@ -206,7 +214,7 @@ def _parse_header(
     header: bytes, path: Path, rules: Mapping[str, type]
 ) -> tuple[PriorSettings, Any]:
     """Parse and check a header. Return the settings and the rule of the prior."""
-    fields = ["cell_m", "classes", "place", "rule", "tile_m"]
+    fields = ["cell_m", "classes", "place", "rule", "tile_m"]  # sorted
     try:
         values: Any = json.loads(header)
         if not isinstance(values, dict) or sorted(values) != fields:
@@ -229,18 +237,19 @@ def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey
     # Bytes between the start of a tile and the index. Offsets are unsigned integers, so without the
     # minimum the difference would wrap around to a huge number for an offset beyond the end.
     longest = end - np.minimum(offsets, end)
-    inside = (offsets >= start) & (offsets <= end) & (rows["length"] <= longest)
+    is_valid = (offsets >= start) & (offsets <= end) & (rows["length"] <= longest)
     tile_columns = np.abs(rows["column"].astype(np.int64))
     tile_rows = np.abs(rows["row"].astype(np.int64))
-    inside &= (tile_columns <= FARTHEST_TILE) & (tile_rows <= FARTHEST_TILE)
+    is_valid &= (tile_columns <= FARTHEST_TILE) & (tile_rows <= FARTHEST_TILE)
     # Tiles that share bytes would let a small file become a large map.
     by_offset = rows[np.argsort(offsets, kind="stable")]
     tile_ends = by_offset["offset"].astype(np.int64) + by_offset["length"]
-    overlap = (tile_ends[:-1] > by_offset["offset"][1:].astype(np.int64)).any()
+    do_overlap = (tile_ends[:-1] > by_offset["offset"][1:].astype(np.int64)).any()
     entries = {}
     for column, row, offset, length, crc in rows.tolist():
         entries[column, row] = (offset, length, crc)
-    if not inside.all() or overlap or len(entries) != len(rows):
+    # There are fewer entries than rows if a tile occurs twice.
+    if not is_valid.all() or do_overlap or len(entries) != len(rows):
         raise InputError(
             f"{path} is damaged: its index names tiles outside of the file or twice; build it "
             "again."
@@ -257,6 +266,9 @@ def unpack_tile(content: bytes, crc: int, num_bytes: int, path: Path | str) -> b
         num_bytes: Expected size of the decompressed states in bytes.
         path: Name of the file, for messages.
 
+    Returns:
+        States of the tile. They can be changed in place, unlike bytes.
+
     Raises:
         ValueError: If the tile is damaged.
     """
@@ -265,7 +277,7 @@ def unpack_tile(content: bytes, crc: int, num_bytes: int, path: Path | str) -> b
         # One more byte than expected is enough to detect a tile that is too large.
         states = unpacker.decompress(content, num_bytes + 1)
     except zlib.error:
-        states = b""
+        states = b""  # with a wrong length, or an unfinished stream, so the check below fails
     if zlib.crc32(content) != crc or len(states) != num_bytes or not unpacker.eof:
         raise InputError(f"{path} is damaged: a tile cannot be read; copy or build it again.")
     return bytearray(states)

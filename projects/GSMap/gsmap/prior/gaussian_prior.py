@@ -34,7 +34,8 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
 Stored = NDArray[np.void]
-"""Gaussians of a tile; positions are relative to its corner."""
+"""Gaussians of a tile, an array of ``_STORED``; positions are relative to its corner."""
+# Units are metres, radians and square metres. The variance is across the line.
 _STORED = np.dtype(
     [
         ("label", "<u2"),
@@ -45,7 +46,7 @@ _STORED = np.dtype(
         ("misses", "<f4"),
     ]
 )
-_MOST_PER_TILE = 100_000
+_MOST_PER_TILE = 100_000  # in a file
 _COUNT_BYTES = 4  # a tile in a file begins with the number of its Gaussians, in these bytes
 # A Gaussian is removed if its value is below the first number, and its hits and misses together
 # are at least the second one.
@@ -75,11 +76,12 @@ class GaussianPrior:
     deviation along the line is half of the distance between neighbouring Gaussians. It also has
     counts of hits and misses, which decay. A frame that has the Gaussian in view adds p to its hits
     and 1 - p to its misses, where p is the score of the line that measures it, or 0 without such a
-    line. Areas are stored as their outlines. All methods may be called from several threads. All
-    Gaussians are kept in memory.
+    line. The value of a Gaussian is the share of hits (`GaussianRule`). Areas are stored as their
+    outlines. All methods may be called from several threads. All Gaussians are kept in memory.
 
     Args:
-        settings: Classes, place and tiles; the size of cells is not used.
+        settings: Classes, place (name of the global frame) and tiles; the size of cells is not
+            used.
         rule: Settings of the Gaussians; ``GaussianRule()`` by default.
 
     Attributes:
@@ -103,9 +105,11 @@ class GaussianPrior:
             settings: Classes, place and tiles that the file must have; None to accept any.
 
         Raises:
+            FileNotFoundError: If the file does not exist.
             ValueError: If the file is no valid Gaussian prior, or has other settings.
         """
         path = Path(path)
+        # Each entry is the offset, length and checksum of a tile in `content`.
         content, file_settings, rule, entries = read_file(path, settings, magic=GAUSSIAN_MAGIC)
         prior = cls(file_settings, rule)
         for key, (offset, length, crc) in entries.items():
@@ -123,8 +127,10 @@ class GaussianPrior:
 
         Raises:
             RuntimeError: If the file is reserved by another process.
+            ValueError: If another program has written the lock file beside it.
         """
         with self._lock:
+            # The order of the keys makes the files of equal priors equal.
             tiles = [(key, _pack(self._tiles[key])) for key in sorted(self._tiles)]
             save_file(Path(path), self.settings, rule=self.rule, tiles=tiles, magic=GAUSSIAN_MAGIC)
 
@@ -142,21 +148,22 @@ class GaussianPrior:
 
         Returns:
             Centres in metres in the global frame (N, 2), covariances in square metres (N, 2, 2),
-            and values in [0, 1] (N,).
+            and values in [0, 1] (N,). Gaussians with small values, which are not drawn, are
+            included.
         """
         with self._lock:
-            active = _Active.gather(self._tiles, sorted(self._tiles), self.settings.tile_m)
-        active = active.select(active.labels == label)
-        cos = np.cos(active.angles)
-        sin = np.sin(active.angles)
+            gaussians = _GaussianSet.gather(self._tiles, sorted(self._tiles), self.settings.tile_m)
+        gaussians = gaussians.select(gaussians.labels == label)
+        cos = np.cos(gaussians.angles)
+        sin = np.sin(gaussians.angles)
         # Rotation matrices, whose columns are the directions along and across the line. (N, 2, 2)
         first_rows = np.stack([cos, -sin], axis=-1)
         second_rows = np.stack([sin, cos], axis=-1)
         axes = np.stack([first_rows, second_rows], axis=-2)
-        along = np.full(len(cos), (self.rule.spacing_m / 2) ** 2)
-        variances = np.stack([along, active.variances], axis=-1)
+        along_variances = np.full(len(cos), (self.rule.spacing_m / 2) ** 2)
+        variances = np.stack([along_variances, gaussians.variances], axis=-1)
         covariances = (axes * variances[:, None, :]) @ axes.transpose(0, 2, 1)
-        return active.means, covariances, active.values(self.rule)
+        return gaussians.means, covariances, gaussians.values(self.rule)
 
     def write(
         self, pose: Pose, grid: BEVGrid, elements: MapElements, visible: Raster | None = None
@@ -171,10 +178,10 @@ class GaussianPrior:
         Args:
             pose: Transform from the frame to the global frame, in metres. Far from the origin it
                 must be float64. (4, 4)
-            grid: Extent of the frame, which is in view.
+            grid: Extent of the frame, which is in view, and its cells, H rows and W columns.
             elements: Prediction in metres in the frame, with labels of the classes of the prior.
             visible: Whether a cell of ``grid`` is in view and not occluded, bool; None if all are.
-                (H, W)
+                A Gaussian outside of these cells does not change unless a line measures it. (H, W)
 
         Raises:
             ValueError: If a label or a shape is wrong, or ``pose`` is no rigid transform or too far
@@ -189,25 +196,26 @@ class GaussianPrior:
             in_view = to_numpy(visible)
             if in_view.shape != (grid.height, grid.width) or in_view.dtype != np.bool_:
                 raise InputError(f"visible must be bool of shape {(grid.height, grid.width)}.")
-        frame = planar_pose(pose)
+        frame = planar_pose(pose)  # position and yaw; heights and tilts are not used
         with self._lock:
             keys = self._keys_in_view(frame, grid)
-            active = _Active.gather(self._tiles, keys, self.settings.tile_m)
-            is_in_view = active.are_in_view(frame, grid, in_view=in_view)
-            parts = []
+            gaussians = _GaussianSet.gather(self._tiles, keys, self.settings.tile_m)
+            is_in_view = gaussians.are_in_view(frame, grid, in_view=in_view)
+            updated_sets = []
             for label in range(num_classes):
-                is_of_class = active.labels == label
-                of_class = active.select(is_of_class)
+                is_of_class = gaussians.labels == label
+                of_class = gaussians.select(is_of_class)  # a copy
                 lines = sample_lines(elements, label, frame, rule=self.rule)
+                # For each Gaussian, the line that measures it and the distance from this line.
                 measurements = measure(of_class.means, of_class.angles, lines)
                 of_class.update(measurements, is_in_view[is_of_class], self.rule)
-                kept = of_class.select(~of_class.are_forgotten(self.rule))
-                parts.append(kept)
-                parts.append(_new_gaussians(kept, lines, label=label, rule=self.rule))
+                remaining = of_class.select(~of_class.are_forgotten(self.rule))
+                updated_sets.append(remaining)
+                updated_sets.append(_new_gaussians(remaining, lines, label=label, rule=self.rule))
             # Some Gaussians may have moved to another tile, so all of them are distributed again.
             for key in keys:
                 self._tiles.pop(key, None)
-            _Active.join(parts).scatter(self._tiles, self.settings.tile_m)
+            _GaussianSet.join(updated_sets).scatter(self._tiles, self.settings.tile_m)
 
     def read(self, pose: Pose, grid: BEVGrid) -> Tensor:
         """Draw the lines at their mean positions in the cells of a frame, as `MapPrior.read` does.
@@ -228,6 +236,8 @@ class GaussianPrior:
     def read_masks(self, pose: Pose, grid: BEVGrid) -> GaussianMasks:
         """Draw the prior in the cells of a frame (GSMap Eq. 6).
 
+        Gaussians whose value is below ``rule.least_value`` are not drawn.
+
         Args:
             pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
                 origin it must be float64. (4, 4)
@@ -242,34 +252,36 @@ class GaussianPrior:
         frame = planar_pose(pose)
         with self._lock:
             keys = self._keys_in_view(frame, grid)
-            active = _Active.gather(self._tiles, keys, self.settings.tile_m)
-        active = active.select(active.values(self.rule) >= self.rule.least_value)
+            gaussians = _GaussianSet.gather(self._tiles, keys, self.settings.tile_m)
+        gaussians = gaussians.select(gaussians.values(self.rule) >= self.rule.least_value)
         # Gaussians of each class, padded to the number n of the class with the most Gaussians:
         # arrays (C, n, ...).
         num_classes = len(self.settings.classes)
-        counts = np.bincount(active.labels, minlength=num_classes)
+        counts = np.bincount(gaussians.labels, minlength=num_classes)
         shape = (num_classes, max(1, int(counts.max(initial=0))))
         means = np.full((*shape, 2), _FAR_M)
         scales = np.ones((2, *shape, 2))  # for the masks of means and of spreads
         rotations = np.zeros(shape)
-        local = frame.to_frame(active.means)
-        turns = active.angles - np.arctan2(frame.sin, frame.cos)
-        width = self.rule.line_sigma_m
+        local = frame.to_frame(gaussians.means)
+        local_angles = gaussians.angles - np.arctan2(frame.sin, frame.cos)
+        line_sigma_m = self.rule.line_sigma_m  # standard deviation of a drawn line across it
         for label in range(num_classes):
-            chosen = active.labels == label
+            chosen = gaussians.labels == label
             part = (label, slice(counts[label]))  # entries of the class without the padding
             means[part] = local[chosen]
-            rotations[part] = turns[chosen]
+            rotations[part] = local_angles[chosen]
             scales[:, label, : counts[label], 0] = self.rule.spacing_m / 2
-            scales[0, label, : counts[label], 1] = width
-            scales[1, label, : counts[label], 1] = np.sqrt(width**2 + active.variances[chosen])
+            scales[0, label, : counts[label], 1] = line_sigma_m
+            spread_variances = line_sigma_m**2 + gaussians.variances[chosen]
+            scales[1, label, : counts[label], 1] = np.sqrt(spread_variances)
         device = pose.device if isinstance(pose, Tensor) else torch.device("cpu")
+        # The masks of means and of spreads are drawn in one call. They differ only in the scales.
         masks = render_gaussians(
             torch.from_numpy(np.stack([means, means])).float().to(device),
             torch.from_numpy(scales).float().to(device),
             rotations=torch.from_numpy(np.stack([rotations, rotations])).float().to(device),
             grid=grid,
-        )
+        )  # (2, C, H, W)
         return GaussianMasks(masks[0], spread=masks[1])
 
     def _keys_in_view(self, frame: PlanarPose, grid: BEVGrid) -> list[TileKey]:
@@ -291,7 +303,7 @@ class GaussianPrior:
         return keys
 
 
-class _Active:
+class _GaussianSet:
     """Gaussians of some tiles in the global frame, in float64.
 
     Args:
@@ -320,10 +332,14 @@ class _Active:
         self.misses = misses
 
     @classmethod
-    def gather(cls, tiles: dict[TileKey, Stored], keys: list[TileKey], tile_m: float) -> "_Active":
+    def gather(
+        cls, tiles: dict[TileKey, Stored], keys: list[TileKey], tile_m: float
+    ) -> "_GaussianSet":
         """Join the Gaussians of tiles, and convert their positions to the global frame."""
+        # The empty array is for the case of no tiles.
         stored = np.concatenate([np.zeros(0, _STORED), *(tiles[key] for key in keys)])
         counts = [len(tiles[key]) for key in keys]
+        # Corner of each tile with the smallest x and y. (tiles, 2)
         corners = tile_m * np.array(keys, dtype=np.float64).reshape(-1, 2)
         return cls(
             labels=stored["label"].astype(np.int64),
@@ -335,16 +351,16 @@ class _Active:
         )
 
     @classmethod
-    def join(cls, parts: list["_Active"]) -> "_Active":
+    def join(cls, parts: list["_GaussianSet"]) -> "_GaussianSet":
         """Concatenate Gaussians."""
         columns = {}
         for name in ("labels", "means", "angles", "variances", "hits", "misses"):
             columns[name] = np.concatenate([getattr(part, name) for part in parts])
         return cls(**columns)
 
-    def select(self, index: NDArray[np.bool_]) -> "_Active":
+    def select(self, index: NDArray[np.bool_]) -> "_GaussianSet":
         """Select Gaussians by a mask. (N,)"""
-        return _Active(
+        return _GaussianSet(
             labels=self.labels[index],
             means=self.means[index],
             angles=self.angles[index],
@@ -378,7 +394,7 @@ class _Active:
     def update(
         self, measurements: Measurements, is_in_view: NDArray[np.bool_], rule: GaussianRule
     ) -> None:
-        """Update Gaussians by their measurements, and count hits and misses.
+        """Update Gaussians in place by their measurements, and count hits and misses.
 
         Args:
             measurements: Measurements. (N,) each
@@ -387,6 +403,7 @@ class _Active:
         """
         # A line at the edge of the view may measure a Gaussian that is just outside of the view.
         is_observed = is_in_view | measurements.is_found
+        # A gain is the share of the distance by which a centre moves; 0 without a measurement.
         variances, gains = fuse_across(
             self.variances, measurements, rule.decay, least_variance=rule.least_sigma_m**2
         )
@@ -394,7 +411,7 @@ class _Active:
         self.means = self.means + (gains * measurements.distances)[:, None] * normals
         self.angles = self.angles + gains * measurements.turns
         self.variances = variances
-        scores = measurements.scores
+        scores = measurements.scores  # 0 without a measurement
         decay = np.where(is_observed, rule.decay, 1.0)
         self.hits = decay * self.hits + scores
         self.misses = decay * self.misses + np.where(is_observed, 1.0 - scores, 0.0)
@@ -402,12 +419,14 @@ class _Active:
     def scatter(self, tiles: dict[TileKey, Stored], tile_m: float) -> None:
         """Add each Gaussian to the tile that contains its centre."""
         tile_keys = np.floor(self.means / tile_m).astype(np.int64)  # columns and rows. (N, 2)
-        # Versions of NumPy differ in the shape of the inverse, (N,) or (N, 1).
+        # Distinct keys, and the index of the key of each Gaussian. Versions of NumPy differ in the
+        # shape of these indices, (N,) or (N, 1).
         keys, key_indices = np.unique(tile_keys, axis=0, return_inverse=True)
         key_indices = key_indices.ravel()
         stored = np.zeros(len(self.labels), _STORED)
         stored["label"] = self.labels
         stored["position"] = self.means - tile_m * tile_keys
+        # Updates may have moved an angle out of [-pi, pi].
         stored["angle"] = np.arctan2(np.sin(self.angles), np.cos(self.angles))
         stored["variance"] = self.variances
         stored["hits"] = self.hits
@@ -418,19 +437,23 @@ class _Active:
             tiles[column, row] = np.concatenate([present, added])
 
 
-def _new_gaussians(kept: _Active, lines: LineSamples, label: int, rule: GaussianRule) -> _Active:
+def _new_gaussians(
+    remaining: _GaussianSet, lines: LineSamples, label: int, rule: GaussianRule
+) -> _GaussianSet:
     """Create Gaussians at the points of lines that no Gaussian describes.
 
     Args:
-        kept: Gaussians of the class.
+        remaining: Gaussians of the class.
         lines: Points along the lines of the frame.
         label: Index of the class.
         rule: Settings.
     """
-    is_covered = find_covered_points(kept.means, kept.angles, lines=lines, spacing_m=rule.spacing_m)
+    is_covered = find_covered_points(
+        remaining.means, remaining.angles, lines=lines, spacing_m=rule.spacing_m
+    )
     is_new = ~is_covered
     scores = lines.scores[is_new]
-    return _Active(
+    return _GaussianSet(
         labels=np.full(len(scores), label),
         means=lines.points[is_new],
         angles=lines.angles[is_new],
@@ -454,7 +477,7 @@ def _unpack(content: bytes, crc: int, path: Path) -> Stored:
     packed = content[_COUNT_BYTES:]
     num_bytes = count * _STORED.itemsize
     # `unpack_tile` needs a checksum of the compressed bytes alone. The stored checksum includes the
-    # count, and is checked above.
+    # count, and is checked above. A tile that is larger than `num_bytes` is refused.
     states = unpack_tile(packed, crc=zlib.crc32(packed), num_bytes=num_bytes, path=path)
     return np.frombuffer(states, dtype=_STORED)
 

@@ -1,4 +1,9 @@
-"""Settings of a Gaussian prior."""
+"""Settings of a Gaussian prior, a map of earlier drives that stores Gaussians along lines.
+
+A Gaussian counts hits and misses. A frame that has it in view adds p to its hits and 1 - p to its
+misses, where p is the score of the line that measures it, or 0 without such a line. The value of a
+Gaussian is hits / (hits + misses + ``prior_count``).
+"""
 
 from dataclasses import dataclass
 
@@ -12,17 +17,17 @@ class GaussianRule:
     Args:
         spacing_m: Distance between new Gaussians along a line, in [0.2, 5] metres. The standard
             deviation of a Gaussian along its line is half of this distance.
-        sigma_m: Standard deviation across the line for predictions without Gaussians, in [0.01, 5]
-            metres.
+        sigma_m: Standard deviation across the line for predictions of a model without Gaussians, in
+            [0.01, 5] metres.
         least_sigma_m: Smallest standard deviation of a Gaussian across its line, in [0.001, 1]
             metres, which covers the errors that all frames share.
         line_sigma_m: Standard deviation of a drawn line across its direction, in [0.05, 2] metres.
         decay: Factor in [0.5, 1] by which older data lose weight. Each frame that has the Gaussian
             in view multiplies the older hits and misses by it. Each line that measures the Gaussian
             multiplies the inverse of the older variance across the line by it.
-        prior_count: Number of misses that is added in the value of a Gaussian, in [0.01, 100].
-        least_value: Smallest value of a Gaussian that is drawn, in [0, 1]. The value is
-            hits / (hits + misses + ``prior_count``).
+        prior_count: Number of misses that is added in the value of a Gaussian, in [0.01, 100]. It
+            lowers the value of Gaussians that few frames have had in view.
+        least_value: Smallest value of a Gaussian that is drawn, in [0, 1].
 
     Raises:
         ValueError: If a setting is out of range.
@@ -53,4 +58,4 @@ class GaussianRule:
 
 
 GAUSSIAN_RULES: dict[str, type] = {"gaussians": GaussianRule}
-"""Settings of Gaussian priors by their name in files."""
+"""Classes of the settings of Gaussian priors, by the name of the kind of prior in files."""

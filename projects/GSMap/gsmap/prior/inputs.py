@@ -1,4 +1,4 @@
-"""Checks and conversions of the arguments of priors: poses, rasters and files."""
+"""Checks and conversions of the arguments of map priors: poses, rasters and files."""
 
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -14,11 +14,11 @@ from gsmap.utils.files import lock_file
 
 Pose = Tensor | NDArray[np.floating[Any]]
 Raster = Tensor | NDArray[Any]
-_FARTHEST_M = 1e7  # largest coordinate of a pose, in metres
+_FARTHEST_M = 1e7  # largest x or y of a pose, in metres
 
 
 class PlanarPose(NamedTuple):
-    """Position and yaw of a frame in the global frame.
+    """Position and yaw of a frame in the global frame, in the plane.
 
     Attributes:
         cos: Cosine of the yaw.
@@ -44,13 +44,14 @@ class PlanarPose(NamedTuple):
 
 
 def planar_pose(pose: Pose) -> PlanarPose:
-    """Check a pose, and return its position and yaw.
+    """Check a pose, and return its position and yaw. Height, roll and pitch are left out.
 
     Args:
         pose: Transform from a frame to the global frame, in metres. (4, 4)
 
     Raises:
-        ValueError: If the pose is not rigid, is too far from the origin, or has no yaw.
+        ValueError: If the pose is not rigid, its x or y is beyond 1e7 m, or it has no yaw because
+            the x axis of the frame is vertical.
     """
     transform = to_numpy(pose).astype(np.float64, copy=False)
     if transform.shape != (4, 4) or not is_rigid(transform):
@@ -74,14 +75,25 @@ def to_numpy(values: Raster) -> NDArray[Any]:
     """Convert a tensor on any device, or an array, to an array."""
     if isinstance(values, Tensor):
         detached = values.detach()
-        if detached.dtype == torch.bfloat16:
+        if detached.dtype == torch.bfloat16:  # numpy has no such type
             detached = detached.float()
         return detached.cpu().numpy()
     return np.asarray(values)
 
 
 def reserve_file(path: Path) -> IO[str]:
-    """Reserve a file for a writer, by a lock file beside it."""
+    """Reserve a file for a writer, by a lock file beside it. Missing folders are created.
+
+    Args:
+        path: File to reserve. It need not exist.
+
+    Returns:
+        The open lock file. The reservation ends when the caller closes it.
+
+    Raises:
+        ValueError: If another program has written the lock file.
+        RuntimeError: If the file is reserved already, by another process or in this one.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     lock_path = path.with_name(f".{path.name}.lock")
     return lock_file(lock_path, subject=path, advice="wait for its end, or write another file")

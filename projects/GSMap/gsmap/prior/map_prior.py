@@ -26,7 +26,8 @@ from gsmap.utils.files import atomic_write
 
 MEMORY_BYTES = 100 << 20
 """Default of ``memory_bytes``, the largest total size of the tiles in memory."""
-# Largest number of the prior's cells in a quadrant of the square around a frame (`_window`).
+# Largest number of the prior's cells in a quarter of the square around a frame. `_window` checks
+# it.
 _MOST_CELLS = 1 << 24
 
 
@@ -43,7 +44,7 @@ class MapPrior:
     `MapElements.to_frame`.
 
     Args:
-        settings: Classes, place and cells.
+        settings: Classes, place (name of the global frame), cells and tiles.
         rule: Rule of writing; `HitMissCounts` by default. `LastSeen` and `KeepMaximum` are the
             rules of HRMapNet (arXiv 2409.00620).
         memory_bytes: Largest total size of the tiles in memory. A tile of three classes takes
@@ -63,7 +64,8 @@ class MapPrior:
         tile_shape = (self.rule.num_states, num_classes, side, side)
         self._tiles = TileStore(tile_shape, memory_bytes=memory_bytes)
         self._lock = threading.RLock()
-        self._owner: IO[str] | None = None  # open file that reserves `_owned_path`
+        # Open lock file that reserves the file `_owned_path` until it is closed.
+        self._owner: IO[str] | None = None
         self._owned_path: Path | None = None
 
     @classmethod
@@ -84,21 +86,24 @@ class MapPrior:
             memory_bytes: Largest total size of the tiles in memory.
 
         Returns:
-            The prior.
+            The prior, which keeps the file open until `close`.
 
         Raises:
+            FileNotFoundError: If the file does not exist.
             ValueError: If the file is no valid prior, or has other settings.
             RuntimeError: If the file is reserved by another process, or by another prior in this
                 process.
         """
         path = Path(path)
         owner = reserve_file(path) if update else None
+        # After an error, the file is closed and its reservation ends.
         try:
             mapped = _map_file(path)
             try:
-                found, rule, tile_entries = read_header(mapped, path)
+                # `tile_entries` has the offset, length and checksum of each tile.
+                file_settings, rule, tile_entries = read_header(mapped, path)
                 if settings is not None:
-                    settings.require_equal(found, str(path))
+                    settings.require_equal(file_settings, str(path))
             except BaseException:
                 mapped.close()
                 raise
@@ -106,7 +111,7 @@ class MapPrior:
             if owner is not None:
                 owner.close()
             raise
-        prior = cls(found, rule, memory_bytes=memory_bytes)
+        prior = cls(file_settings, rule, memory_bytes=memory_bytes)
         prior._tiles.open(mapped, path=path, entries=tile_entries)
         prior._owner = owner
         prior._owned_path = path.resolve() if update else None
@@ -121,9 +126,11 @@ class MapPrior:
         Raises:
             RuntimeError: If the file is reserved by another process, or by another prior in this
                 process.
+            ValueError: If another program has written the lock file beside it.
         """
         path = Path(path)
         with self._lock:
+            # A file that `load` has reserved for this prior must not be reserved a second time.
             owns_file = self._owned_path == path.resolve()
             owner = None if owns_file else reserve_file(path)
             try:
@@ -194,7 +201,7 @@ class MapPrior:
         with self._lock:
             canvas = self._load_canvas(window)
         flat_canvas = _flatten_cells(canvas)
-        # The rule stores S numbers (states) for each class of a cell.
+        # The rule stores S numbers (states) for each class of a cell, and converts them to values.
         states = flat_canvas[..., window.cells]  # (S, C, H * W)
         values = self.rule.read(states).reshape(-1, grid.height, grid.width)
         device = pose.device if isinstance(pose, Tensor) else torch.device("cpu")
@@ -224,7 +231,7 @@ class MapPrior:
         expected = (len(self.settings.classes), *size)
         if prediction.shape != expected:
             raise InputError(f"values must have shape {expected}, got {prediction.shape}.")
-        if not (prediction.min() >= 0 and prediction.max() <= 1):  # False for NaN
+        if not (prediction.min() >= 0 and prediction.max() <= 1):  # also refuses NaN
             raise InputError("values must be in [0, 1].")
         in_view = np.ones(size, dtype=np.bool_) if visible is None else to_numpy(visible)
         if in_view.shape != size or in_view.dtype != np.bool_:
@@ -239,6 +246,7 @@ class MapPrior:
             chosen = np.flatnonzero(in_view)
             cells = cells[chosen]
             flat_values = flat_values[:, chosen]
+        # Cells of the prior that are written, and their values.
         touched, largest = _largest_per_cell(cells, flat_values, size=window.height * window.width)
         with self._lock:
             canvas = self._load_canvas(window)
@@ -264,6 +272,7 @@ class MapPrior:
         """
         if not 0 < width_m <= 10:
             raise InputError(f"width_m must be in (0, 10], got {width_m}.")
+        # For each tile, a mask of the cells that each class covers. (C, tile_cells, tile_cells)
         for key, covered in covered_cells(elements, settings=self.settings, width_m=width_m):
             with self._lock:
                 tile = self._tiles.get_to_write(key, empty=self.rule.empty)
@@ -283,13 +292,14 @@ class MapPrior:
         x = grid.x_range[0] + dx * (np.arange(grid.width) + 0.5)  # (W,)
         y = grid.y_range[0] + dy * (np.arange(grid.height) + 0.5)  # (H,)
         # The grid lies in a square around the origin of the frame, which reaches corner_m to each
-        # side. Each of its quadrants may have _MOST_CELLS cells of the prior.
+        # side. Each quarter of the square may have _MOST_CELLS cells of the prior.
         corner_m = max(map(abs, (*grid.x_range, *grid.y_range)))
         square_cells = (2 * corner_m / self.settings.cell_m) ** 2
         if not square_cells <= 4 * _MOST_CELLS:  # also refuses NaN
             raise InputError(
                 f"the grid reaches {corner_m:g} m, too far for cells of {self.settings.cell_m:g} m."
             )
+        # Centres of the frame's cells in the global frame.
         global_x = (cos * x + frame.x_m) - sin * y[:, None]  # (H, W)
         global_y = (sin * x + frame.y_m) + cos * y[:, None]
         columns = np.floor(global_x / self.settings.cell_m).astype(np.int64)
@@ -299,7 +309,8 @@ class MapPrior:
         width = int(columns.max()) - first_column + 1
         height = int(rows.max()) - first_row + 1
         cells = (rows - first_row) * width + (columns - first_column)
-        # Poses and grids are bounded, so the columns and rows of tiles fit the index of a file.
+        # Poses and grids are bounded, so the columns and rows of tiles fit into the index of a
+        # file, which stores them as integers.
         farthest = max(abs(first_column), abs(first_row)) + max(width, height)
         assert farthest < FARTHEST_TILE * self.settings.tile_cells
         return _Window(
@@ -311,7 +322,7 @@ class MapPrior:
         )
 
     def _load_canvas(self, window: "_Window") -> States:
-        """Copy the tiles of a window to one raster. (S, C, height, width)"""
+        """Copy the tiles of a window to one raster; tiles may be missing. (S, C, height, width)"""
         num_states, num_classes = self._tiles.shape[:2]
         shape = (num_states, num_classes, window.height, window.width)
         canvas = np.full(shape, self.rule.empty, dtype=np.uint8)
@@ -421,7 +432,7 @@ def _largest_per_cell(
     Args:
         cells: Cell of the prior in which each cell of the frame lies, as an index into the window,
             in [0, size). (n,)
-        values: Prediction. (C, n)
+        values: Prediction in each cell of the frame, in [0, 1]. (C, n)
         size: Number of cells of the window.
 
     Returns:
@@ -431,6 +442,7 @@ def _largest_per_cell(
     is_touched = np.zeros(size, dtype=np.bool_)
     is_touched[cells] = True
     touched = np.flatnonzero(is_touched)
+    # Values are >= 0, so the zeros do not change a maximum.
     largest = torch.zeros(len(values), size)
     index = torch.from_numpy(cells)
     for channel, channel_values in zip(largest, values, strict=True):

@@ -1,4 +1,4 @@
-"""Classes, place and cells of a map prior."""
+"""Settings of a map prior: its classes, its global frame and its cells."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,11 +18,13 @@ class PriorSettings:
         classes: Names of the classes. Each class is a channel of the prior.
         place: Name of the global frame of the poses, such as the name of a city or a map.
         cell_m: Side of a cell in metres, in [0.01, 10].
-        tile_m: Side of a tile (square of cells) in metres: a multiple of ``cell_m``, at most 1024
+        tile_m: Side of a tile (square of cells) in metres: a multiple of ``cell_m``, 1 to 1024
             cells.
 
     Raises:
-        ValueError: If a value is invalid.
+        ValueError: If there are no classes, more than 64, or two of one name; if a name is not
+            printable, empty or longer than 200 letters; or if ``cell_m`` or ``tile_m`` is no number
+            or out of range.
     """
 
     classes: tuple[str, ...]
@@ -31,8 +33,8 @@ class PriorSettings:
     tile_m: float = 60.0
 
     def __post_init__(self) -> None:
-        classes = tuple(self.classes)
-        object.__setattr__(self, "classes", classes)
+        classes = tuple(self.classes)  # a list is accepted, too
+        object.__setattr__(self, "classes", classes)  # the dataclass is frozen
         if not 1 <= len(classes) <= _MOST_CLASSES or len(set(classes)) != len(classes):
             raise InputError(
                 f"classes must be 1 to {_MOST_CLASSES} different names, got {len(classes)}."
@@ -44,7 +46,10 @@ class PriorSettings:
         if not 0.01 <= self.cell_m <= 10:
             raise InputError(f"cell_m must be in [0.01, 10], got {self.cell_m}.")
         cells = self.tile_m / self.cell_m
-        is_in_range = 1 <= cells <= _MOST_TILE_CELLS + 0.5  # tolerates rounding of the quotient
+        # For a tile of 1024 cells, rounding may make the quotient slightly larger, so the upper
+        # limit has a margin. The test for a whole number rejects all other quotients in the margin.
+        # The lower limit has no margin, since both sides of a tile with one cell are equal.
+        is_in_range = 1 <= cells <= _MOST_TILE_CELLS + 0.5
         if not is_in_range or abs(cells - round(cells)) > 1e-6:
             raise InputError(
                 f"tile_m must be 1 to {_MOST_TILE_CELLS} cells of {self.cell_m:g} m, got "
@@ -57,22 +62,22 @@ class PriorSettings:
         return round(self.tile_m / self.cell_m)
 
     def require_equal(self, other: "PriorSettings", where: str) -> None:
-        """Check that the settings of a file are equal to these settings.
+        """Check that the settings of another prior are equal to these settings.
 
         Args:
-            other: Settings of the file.
-            where: Name of the file, for the message.
+            other: Settings of the other prior, such as one that was read from a file.
+            where: Name of the file or of the other prior, for the message.
 
         Raises:
             ValueError: If a value differs.
         """
         for name in ("classes", "place", "cell_m", "tile_m"):
             expected = getattr(self, name)
-            found = getattr(other, name)
-            if found != expected:
+            other_value = getattr(other, name)
+            if other_value != expected:
                 raise InputError(
-                    f"{where} has {name} {found!r}, and {expected!r} is needed: give a prior with "
-                    f"{name} {expected!r}, or build one."
+                    f"{where} has {name} {other_value!r}, and {expected!r} is needed: give a prior "
+                    f"with {name} {expected!r}, or build one."
                 )
 
 
@@ -85,6 +90,6 @@ def _require_name(name: Any) -> None:
 
 
 def _require_number(name: str, value: Any) -> None:
-    """Check that a value is a number; True and False are not numbers here."""
+    """Check that a value is a number, and not True or False, which are integers in Python."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{name} must be a number.")

@@ -15,12 +15,14 @@ from gsmap.structures.polylines import Points, resample
 from gsmap.utils.errors import InputError
 
 MAX_DEGREE = 5
-SAMPLES = 100  # number of points of a line, and of a piece, that a fit compares, with both ends
-# Limit of the work of a search for joints, per vertex of the line. The work of a fit is the number
-# of points that it compares.
+# A fit compares a line with a piece at this number of points of each. Both ends are included.
+SAMPLES = 100
+# Limit of the work of a search for joints, as a number of points per vertex of the line. The work
+# of one fit is the number of vertices and points that it compares.
 _WORK = 2000
 
 Float = NDArray[np.float64]
+# Function from the vertices of a line and the points of a curve to their deviation in metres.
 Deviation = Callable[[Float, Float], float]
 
 
@@ -33,7 +35,8 @@ def bernstein(degree: int, num_points: int = SAMPLES) -> Float:
         num_points: Number of values of the parameter from 0 to 1, both included.
 
     Returns:
-        Weights, whose rows sum to 1. (num_points, degree + 1)
+        Weights, whose rows sum to 1. The array is cached, so it must not be changed.
+        (num_points, degree + 1)
 
     Raises:
         ValueError: If the degree is out of range.
@@ -51,14 +54,15 @@ def curve_points(controls: Points, degree: int, num_points: int = SAMPLES) -> Fl
 
     Args:
         controls: Control points in metres. (k * degree + 1, D)
-        degree: Degree of each piece.
+        degree: Degree of each piece, 1 to ``MAX_DEGREE``.
         num_points: Number of points of a piece, both ends included.
 
     Returns:
         Points in metres; joints occur once. (k * (num_points - 1) + 1, D)
 
     Raises:
-        ValueError: If the number of control points does not fit k >= 1 pieces.
+        ValueError: If the degree is out of range, or the number of control points does not fit
+            k >= 1 pieces.
     """
     controls = np.asarray(controls, dtype=np.float64)
     weights = bernstein(degree, num_points)
@@ -70,6 +74,7 @@ def curve_points(controls: Points, degree: int, num_points: int = SAMPLES) -> Fl
     pieces = []
     for start in range(0, len(controls) - 1, degree):
         piece = weights @ controls[start : start + degree + 1]
+        # A later piece begins at the end of the previous one, so its first point is left out.
         pieces.append(piece if start == 0 else piece[1:])
     return np.concatenate(pieces)
 
@@ -90,10 +95,13 @@ def fit_piece(points: Points, degree: int) -> Float:
 
     Args:
         points: Vertices in metres. (n >= 2, D)
-        degree: Degree of the piece.
+        degree: Degree of the piece, 1 to ``MAX_DEGREE``.
 
     Returns:
         Control points in metres. (degree + 1, D)
+
+    Raises:
+        ValueError: If the degree is out of range.
     """
     controls = _inverse(degree) @ resample(points, SAMPLES)
     controls[0] = points[0]
@@ -115,9 +123,9 @@ def mean_deviation(line: Float, curve: Float, ignored_m: float = 0.05) -> float:
     """
     from scipy.spatial import distance  # imported here: result files are read without scipy
 
-    between = distance.cdist(resample(line, SAMPLES), curve)
-    from_curve = between.min(0)
-    from_line = between.min(1)
+    between = distance.cdist(resample(line, SAMPLES), curve)  # (100, m)
+    from_curve = between.min(0)  # from each point of the curve to the line
+    from_line = between.min(1)  # from each point of the line to the curve
     mean_from_curve = np.where(from_curve <= ignored_m, 0, from_curve).mean()
     mean_from_line = np.where(from_line <= ignored_m, 0, from_line).mean()
     return float(np.mean([mean_from_curve, mean_from_line]))
@@ -155,6 +163,7 @@ def _fit_test(degree: int, max_error_m: float, deviation: Deviation) -> Callable
         curve = curve_points(fit_piece(part, degree), degree)
         return deviation(part, curve) < max_error_m
 
+    # Only for the default deviation, there is a compiled function, which is much faster.
     if deviation is not largest_deviation:
         return fits
     from gsmap.structures.curve_kernels import deviation_of_fit
@@ -178,9 +187,10 @@ def fit_joints(
 ) -> list[int]:
     """Find the vertices of a line at which the pieces of its curve meet.
 
-    Each piece is as long as the error allows. The work of the search is limited. Long lines that
-    turn at each vertex can reach the limit. From there on, the length of each piece is doubled as
-    long as the piece fits.
+    Each piece is as long as the error allows: its end is searched from the end of the line
+    backwards. Since this takes very long for long lines that turn at each vertex, the work of the
+    search is limited. After the limit is reached, each piece starts with one edge of the line, and
+    its length is doubled as long as the piece fits.
 
     Args:
         points: Vertices in metres. (n >= 2, D)
@@ -208,12 +218,14 @@ def fit_joints(
         start = joints[-1]
         end = last  # the longest piece is tried first
         while end > start + 1 and work > 0:
-            work -= end - start + SAMPLES
+            work -= end - start + SAMPLES  # vertices of the part, and points of the piece
             if fits(points[start : end + 1]):
                 break
             end -= 1
-        if work <= 0:  # the limit is reached, so the length is doubled instead
-            end = start + 1
+        # The limit is reached, so the length is doubled instead. This replaces the end above, even
+        # if the very last fit of the search was good.
+        if work <= 0:
+            end = start + 1  # a piece between neighbouring vertices is exact
             farther = min(start + 2, last)
             while end < farther and fits(points[start : farther + 1]):
                 end = farther
@@ -228,7 +240,7 @@ def controls_between(points: Points, joints: Sequence[int], degree: int) -> Floa
     Args:
         points: Vertices in metres. (n >= 2, D)
         joints: Indices of the vertices in rising order, both ends included. (k + 1,)
-        degree: Degree of the pieces.
+        degree: Degree of the pieces, 1 to ``MAX_DEGREE``.
 
     Returns:
         Control points in metres. (k * degree + 1, D)
@@ -249,8 +261,9 @@ def fit_pieces(
 ) -> Float:
     """Fit a line with few pieces, each as long as the error allows.
 
-    Pieces meet at vertices of the line (`fit_joints`). A piece between neighbouring vertices is
-    exact, so there is always a fit. The public code of BeMapNet uses ``deviation=mean_deviation``.
+    Pieces meet at vertices of the line, which `fit_joints` selects. A piece between neighbouring
+    vertices is exact, so there is always a fit. The public code of BeMapNet uses
+    ``deviation=mean_deviation``.
 
     Args:
         points: Vertices in metres. (n >= 2, D)

@@ -28,7 +28,7 @@ def cut_to_range(
 
     Returns:
         Parts of the elements in the order of the elements. A part has the score of its element, or
-        1 if the elements have no scores.
+        1 if the elements have no scores. Parts of areas have no z.
     """
     import shapely  # imported here: most programs that use elements cut none
 
@@ -38,14 +38,15 @@ def cut_to_range(
     scores: list[float] = []
     for line, label, score in elements.rows:
         if classes[label] in AREA_CLASSES and len(line) >= _FEWEST_OF_RING:
-            polygon = shapely.make_valid(shapely.Polygon(line))
+            polygon = shapely.make_valid(shapely.Polygon(line))  # the outline may cross itself
             area_in_range = polygon & box
             pieces = []
             for area in shapely.get_parts(area_in_range):
                 if area.area > 0.0:  # parts may also be points or lines
+                    # As in ground truth, an area has an outline and no holes.
                     pieces.append(shapely.get_coordinates(area.exterior))
         else:
-            pieces = clip_to_box(line, x_range, y_range)
+            pieces = clip_to_box(line, x_range, y_range)  # vertices of each part
         parts += pieces
         labels += [label] * len(pieces)
         scores += [score] * len(pieces)

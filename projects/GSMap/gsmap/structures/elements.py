@@ -13,14 +13,14 @@ from gsmap.utils.errors import InputError
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
-PerElement = Sequence[Any] | npt.NDArray[Any]  # an array or a nested list for each element
+PerElement = Sequence[Any] | npt.NDArray[Any]  # one entry for each element: array or nested list
 
 
 def ground_truth_elements(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
     """Return the ground-truth elements of a sample in a pipeline: its list of `MapInstance`.
 
     Args:
-        results: Results of the pipeline so far.
+        results: Dictionary of the sample that the transforms of the pipeline pass on.
         transform: Transform that needs the elements, named in the message.
 
     Raises:
@@ -108,12 +108,12 @@ class MapElements:
         except (TypeError, IndexError, ValueError) as error:
             raise InputError(f"polylines must be lists of (x, y) or (x, y, z): {error}") from error
         offsets = np.cumsum([0, *map(len, polylines)])
-        finite = np.isfinite(points).all(axis=1)
-        _require(finite, offsets, fault="point that is not finite")
+        is_finite = np.isfinite(points).all(axis=1)
+        _require(is_finite, offsets, fault="point that is not finite")
         if scores is not None:
             in_range = (scores >= 0) & (scores <= 1)  # False for NaN
             if not in_range.all():
-                index = in_range.argmin()
+                index = in_range.argmin()  # index of the first False
                 raise InputError(f"element {index} has the score {scores[index]}, not in [0, 1].")
         scales = _per_vertex(scales, "scales", shape=(len(points), 2))
         rotations = _per_vertex(rotations, "rotations", shape=(len(points),))
@@ -121,8 +121,8 @@ class MapElements:
             positive = ((scales > 0) & np.isfinite(scales)).all(axis=1)
             _require(positive, offsets, fault="Gaussian whose scales are not positive numbers")
         if rotations is not None:
-            finite = np.isfinite(rotations)
-            _require(finite, offsets, fault="Gaussian whose rotation is not finite")
+            is_finite = np.isfinite(rotations)
+            _require(is_finite, offsets, fault="Gaussian whose rotation is not finite")
         return cls(points, offsets, labels, scores=scores, scales=scales, rotations=rotations)
 
     def __len__(self) -> int:
@@ -135,7 +135,7 @@ class MapElements:
 
     @property
     def polylines(self) -> list[FloatArray]:
-        """Vertices of each element, as views. N x (P, D)"""
+        """Vertices of each element, as views of ``points``. N x (P, D)"""
         return [self.points[a:b] for a, b in pairwise(self.offsets.tolist())]
 
     @property
@@ -165,7 +165,7 @@ class MapElements:
             Elements with ``dim`` coordinates per vertex.
 
         Raises:
-            ValueError: If the vertices have fewer coordinates.
+            ValueError: If there are vertices and they have fewer coordinates.
         """
         num_coordinates = self.points.shape[1]
         if num_coordinates == dim:
@@ -189,10 +189,12 @@ class MapElements:
             Elements in the other frame.
         """
         axis_x, axis_y = transform[:2, 0]  # the x axis of the elements' frame in the other frame
+        # Roll and pitch shorten the axis in the plane. Its direction there is the yaw.
         cos, sin = transform[:2, 0] / np.hypot(axis_x, axis_y)
-        rotation = np.eye(self.points.shape[1])
+        rotation = np.eye(self.points.shape[1])  # (D, D); z, if present, is only translated
         rotation[:2, :2] = [[cos, -sin], [sin, cos]]
-        points = self.points @ rotation.T + transform[: len(rotation), 3]
+        translation = transform[: len(rotation), 3]  # (D,)
+        points = self.points @ rotation.T + translation
         rotations = self.rotations
         if rotations is not None:
             rotations = rotations + np.arctan2(sin, cos)
@@ -208,7 +210,7 @@ class MapElements:
             Selected elements.
         """
         rows = np.flatnonzero(index) if index.dtype == np.bool_ else np.asarray(index)
-        counts = self.num_points[rows]
+        counts = self.num_points[rows]  # number of vertices of each selected element
         offsets = np.append(0, np.cumsum(counts))
         # Each selected element starts at one of ``offsets`` in the result, and at one of
         # ``self.offsets`` here. The difference, added to the index of a vertex in the result, gives
@@ -234,17 +236,22 @@ def _require(valid: BoolArray, offsets: IntArray, fault: str) -> None:
         fault: Description of an invalid vertex. It ends the message "element i has a ...".
     """
     if not valid.all():
-        first_invalid = valid.argmin()
+        first_invalid = valid.argmin()  # index of the first False
         index = np.searchsorted(offsets, first_invalid, side="right") - 1
         raise InputError(f"element {index} has a {fault}.")
 
 
 def _concatenate(polylines: PerElement) -> FloatArray:
-    """Concatenate the vertices of all polylines. N x (P, 2 or 3) -> (M, 2 or 3)"""
+    """Concatenate the vertices of all polylines. N x (P, 2 or 3) -> (M, 2 or 3)
+
+    The result has two coordinates if any vertex has two. The first polyline that is not empty
+    decides whether all of them are treated as arrays or as nested lists.
+    """
     nonempty = [polyline for polyline in polylines if len(polyline)]
     if not nonempty:
         return np.empty((0, 2))
     are_arrays = isinstance(nonempty[0], np.ndarray)
+    # `dims` contains each number of coordinates per vertex that occurs.
     if are_arrays:
         dims = {polyline.shape[1] for polyline in nonempty}
     else:
@@ -264,7 +271,7 @@ def _per_vertex(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray | 
     """Concatenate the values of the vertices of all polylines, and check the resulting shape."""
     if values is None:
         return None
-    if not len(values):
+    if not len(values):  # no elements: `np.concatenate` needs at least one array
         return np.empty(shape)
     joined = np.concatenate([np.asarray(v, dtype=np.float64) for v in values])
     if joined.shape != shape:

@@ -1,4 +1,7 @@
-"""Kalman update of predicted lines by lines of previous frames. The points are Gaussians."""
+"""Kalman update of predicted lines by known lines, the lines of previous frames.
+
+The points of both kinds of lines are Gaussians.
+"""
 
 from typing import NamedTuple
 
@@ -12,13 +15,14 @@ _MIN_SQUARED_LENGTH = 1e-9
 
 
 class LinePlaces(NamedTuple):
-    """For each point of an element, the nearest place on a line, for K pairs of both.
+    """For each point of an element, the nearest place on a line, for K pairs of element and line.
 
     Attributes:
         distances: Distance of each point from its place, in metres. (K, P)
         segments: Index of the segment of the line on which the place lies. (K, P)
         shares: Position of the place on its segment, in [0, 1]. (K, P)
-        beside: Whether the point lies beside the line, and not beyond one of its ends. (K, P)
+        beside: Whether the point lies beside the line, which means that it is not beyond one of the
+            ends. (K, P)
     """
 
     distances: Tensor
@@ -29,6 +33,8 @@ class LinePlaces(NamedTuple):
 
 def nearest_places(points: Tensor, lines: Tensor) -> LinePlaces:
     """Find the nearest place on a line for each point of an element, in K pairs of both.
+
+    A line is a chain of straight segments between its vertices.
 
     Args:
         points: Points of the element of each pair, in metres. (K, P, 2)
@@ -46,6 +52,8 @@ def nearest_places(points: Tensor, lines: Tensor) -> LinePlaces:
     clamped = shares.clamp(0.0, 1.0)
     squared = (offsets - clamped[:, None] * steps).square().sum(1)  # (K, P, Q - 1)
     squares, segments = squared.min(-1)
+    # `share` is the unlimited position on the nearest segment: < 0 before its start, > 1 behind its
+    # end. Only the first and the last segment have no neighbour there.
     share = shares.gather(-1, segments[..., None])[..., 0]
     clamped = clamped.gather(-1, segments[..., None])[..., 0]
     before = (segments == 0) & (share < 0)
@@ -61,6 +69,7 @@ def _candidate_pairs(
     Returns:
         Index of the element (K,) and of the known line (K,) of each pair.
     """
+    # The gap along an axis is negative if the boxes overlap. The larger gap of both axes counts.
     low, high = now.means.aminmax(dim=1)
     known_low, known_high = known.means.aminmax(dim=1)
     gaps = torch.maximum(low[:, None] - known_high, known_low - high[:, None]).amax(-1)  # (N, M)
@@ -91,7 +100,8 @@ def update_from_known_lines(
             farther, are not updated.
 
     Returns:
-        Updated Gaussians of the elements. (N, P)
+        Gaussians of all elements. An element without a known line, or with fewer than two points
+        beside it, is unchanged, and so is a point that does not lie beside the line. (N, P)
     """
     rows, cols = _candidate_pairs(
         now, labels, known=known, known_labels=known_labels, gate_m=gate_m
@@ -118,6 +128,7 @@ def update_from_known_lines(
     line = line[:, None]
     starts = known.means[line, segments]
     ends = known.means[line, segments + 1]
+    # Covariance of the line at the nearest place, between two vertices. (N, P, 2, 2)
     vertex_covariances = covariances(known)
     line_covariance = torch.lerp(
         vertex_covariances[line, segments],
@@ -135,7 +146,8 @@ def update_from_known_lines(
     updated = with_covariances(means, covariance - gain @ toward.mT, near=now.rotations)
     belongs = (smallest_mean < gate_m)[:, None]
     is_updated = belongs & places.beside[pair] & (point_distances < gate_m)  # (N, P)
-    # The direction has length 1. For a segment of length 0 it has length 0, and there is no normal.
+    # The direction `along` has length 1. For a segment of length 0 it has length 0, and there is no
+    # normal.
     is_updated &= along.norm(dim=-1) > 0.5
     return Gaussians(
         means=torch.where(is_updated[..., None], updated.means, now.means),

@@ -1,4 +1,7 @@
-"""Keys of checkpoints and result files that describe the model and its calibration."""
+"""Keys of checkpoints and result files that describe the model and its calibration.
+
+The calibration fits the sigmas of a model, its predicted standard deviations, to the errors.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,11 +9,11 @@ from typing import Any
 from gsmap.utils.errors import InputError
 
 CHECKPOINT = "checkpoint"  # key in results: SHA-256 of the checkpoint file
-CALIBRATION = "calibration"  # key in checkpoints and results: fit of the sigmas to the errors
+CALIBRATION = "calibration"  # key in checkpoints and results; the value has law and sigmas
 # Key of metainfo: transform from the annotation frame to the ground below the rear axle.
 MOUNT = "mount"
 RIG = "rig"  # key of metainfo: width, height, fx, fy, cx, cy of the images in pixels, by camera
-LAW_NAMES = ("normal", "laplace")  # distributions of the errors
+LAW_NAMES = ("normal", "laplace")  # distributions of the errors, the default first
 
 
 def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,10 +18,14 @@ import numpy as np
 
 # Short names of plain dtypes: booleans, integers, floats, complex numbers, and strings.
 _CODE = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,3}")
-_STATE_PARTS = {int, str, type(None)}  # types of the entries of the state of a plain dtype
+# Types of the entries of the state of a plain dtype. The state is the tuple from which a pickle
+# restores an object after its creation (``__setstate__``).
+_STATE_TYPES = {int, str, type(None)}
 _MAX_DIMS = 8
-_MAX_EMPTY = 1000  # length along an axis of an array without values
-_MAX_INTEGER = {"b": 1, "U": 0x10FFFF}  # largest boolean and largest character
+# Largest length of an axis of an array without values, which the number of bytes does not limit.
+_MAX_EMPTY = 1000
+# Largest boolean and largest character as integers, by the kind of dtype.
+_MAX_INTEGER = {"b": 1, "U": 0x10FFFF}
 
 
 class CheckedDtype:
@@ -43,7 +47,8 @@ class CheckedDtype:
         self.dtype: np.dtype[Any] = np.dtype(code)
 
     def __setstate__(self, state: Any) -> None:
-        is_plain = isinstance(state, tuple) and all(type(part) in _STATE_PARTS for part in state)
+        is_plain = isinstance(state, tuple) and all(type(entry) in _STATE_TYPES for entry in state)
+        # The only valid states are the ones that numpy writes for this dtype in either byte order.
         for candidate in (self.dtype.newbyteorder("<"), self.dtype.newbyteorder(">")):
             numpy_state = candidate.__reduce__()[2]  # state of this dtype in a pickle of numpy
             if is_plain and state == numpy_state:
@@ -56,6 +61,10 @@ class CheckedArray(np.ndarray):
     """Array from a pickle.
 
     The array is empty until its state is set. When it is pickled, it becomes an ordinary array.
+
+    Raises:
+        pickle.UnpicklingError: If the state does not have numpy's form, if its dtype is not a
+            `CheckedDtype`, or if its shape does not fit the number of bytes.
     """
 
     def __new__(cls, *arguments: Any) -> "CheckedArray":
@@ -66,10 +75,10 @@ class CheckedArray(np.ndarray):
 
     def __setstate__(self, state: Any) -> None:  # type: ignore[override]
         try:
-            _version, shape, checked, fortran, data = state
+            _version, shape, checked_dtype, fortran, data = state
         except (TypeError, ValueError):
             raise pickle.UnpicklingError("the state of an array does not have five parts") from None
-        if type(checked) is not CheckedDtype or not isinstance(data, bytes):
+        if type(checked_dtype) is not CheckedDtype or not isinstance(data, bytes):
             raise pickle.UnpicklingError("an array holds something else than plain values")
         is_shape = isinstance(shape, tuple) and all(type(n) is int and n >= 0 for n in shape)
         if not is_shape or len(shape) > _MAX_DIMS:
@@ -77,11 +86,13 @@ class CheckedArray(np.ndarray):
         size = math.prod(shape)
         if size == 0 and max(shape) > _MAX_EMPTY:
             raise pickle.UnpicklingError(f"an array without values has the shape {shape!r:.80}")
-        dtype = checked.dtype
+        dtype = checked_dtype.dtype
         if size * dtype.itemsize != len(data):
             raise pickle.UnpicklingError(f"an array {shape} of {dtype} has {len(data)} bytes")
-        # Booleans above 1, and characters beyond Unicode, are not valid.
+        # Booleans above 1, and characters beyond Unicode, are not valid. The bytes are checked as
+        # integers.
         order = ">" if dtype.byteorder == ">" else "<"
+        # None for other kinds of dtypes, which may have any bytes.
         integer_dtype = {"b": "u1", "U": f"{order}u4"}.get(dtype.kind)
         if integer_dtype and data:
             integers = np.frombuffer(data, dtype=integer_dtype)
@@ -94,7 +105,10 @@ class CheckedArray(np.ndarray):
 
 
 def _array(kind: Any, *_placeholder: Any) -> CheckedArray:
-    """Replacement of numpy's ``_reconstruct``, which creates an empty array."""
+    """Replacement of numpy's ``_reconstruct``, which creates an empty array.
+
+    ``kind`` is the class of the array. A shape and a dtype follow, which the state replaces later.
+    """
     if kind is not CheckedArray:
         raise pickle.UnpicklingError("it makes an array of another class than numpy.ndarray")
     return CheckedArray()
@@ -103,6 +117,7 @@ def _array(kind: Any, *_placeholder: Any) -> CheckedArray:
 def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> CheckedArray:
     """Replacement of numpy's ``_frombuffer``, which creates an array from its bytes."""
     array = CheckedArray()
+    # Pickles of protocol 5 may store the bytes as a bytearray.
     content = bytes(data) if isinstance(data, bytearray) else data
     array.__setstate__((1, shape, dtype, order == "F", content))
     return array
@@ -111,7 +126,7 @@ def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> CheckedArray:
 def _scalar(dtype: Any, data: Any) -> Any:
     """Replacement of numpy's ``scalar``, which creates a scalar from its bytes."""
     array = _from_buffer(data=data, dtype=dtype, shape=(), order="C")
-    return np.asarray(array)[()]
+    return np.asarray(array)[()]  # the scalar of an array without axes
 
 
 def _encode(text: Any, encoding: Any) -> bytes:
@@ -121,6 +136,7 @@ def _encode(text: Any, encoding: Any) -> bytes:
     return text.encode("latin1")
 
 
+# Names without the package, which is `numpy.core` before NumPy 2 and `numpy._core` since then.
 _ARRAY_FUNCTIONS = {
     "multiarray._reconstruct": _array,
     "multiarray.scalar": _scalar,
@@ -133,4 +149,4 @@ CHECKED: dict[str, Any] = {
     **{f"numpy.core.{name}": function for name, function in _ARRAY_FUNCTIONS.items()},
     **{f"numpy._core.{name}": function for name, function in _ARRAY_FUNCTIONS.items()},
 }
-"""Replacements, by the names of the replaced functions in a pickle."""
+"""Replacements, by the names of the replaced functions and classes in a pickle."""

@@ -5,7 +5,8 @@ import sys
 from collections.abc import Iterable
 from typing import Any, TextIO
 
-# Characters that may need an escape. Nearly all text has none, so `_escape` is rarely called.
+# Characters that may need an escape: all but ASCII text, newlines and tabs. Nearly all text has
+# none, so `_escape` is rarely called.
 _UNCOMMON = re.compile(r"[^\x20-\x7e\n\t]+")
 
 
@@ -13,8 +14,9 @@ def printable(text: str) -> str:
     r"""Escape the control characters of a text, as ``repr`` does.
 
     Control characters are ``ESC`` and the other codes below a space, the codes from 0x7f to 0x9f,
-    marks that change the writing direction, and lone surrogates of undecodable bytes. Newlines and
-    tabs are kept.
+    marks that change the writing direction, and lone surrogates of undecodable bytes. All other
+    characters that ``str.isprintable`` refuses, such as a no-break space, are escaped, too.
+    Newlines and tabs are kept.
     """
     return _UNCOMMON.sub(repl=_escape, string=text)
 
@@ -23,7 +25,7 @@ def _escape(match: re.Match[str]) -> str:
     """Escape the characters of a match that are not printable."""
     escaped = []
     for character in match[0]:
-        without_quotes = ascii(character)[1:-1]
+        without_quotes = ascii(character)[1:-1]  # such as \x1b
         escaped.append(character if character.isprintable() else without_quotes)
     return "".join(escaped)
 
@@ -31,7 +33,7 @@ def _escape(match: re.Match[str]) -> str:
 class PrintableStream:
     """Text stream that escapes control characters (`printable`) before it writes to another stream.
 
-    All other attributes come from the wrapped stream.
+    All attributes that are not defined here come from the wrapped stream.
 
     Args:
         stream: Stream to wrap, such as ``sys.stdout``.
@@ -46,7 +48,7 @@ class PrintableStream:
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
-        """Write several texts."""
+        """Write several texts. The method of the wrapped stream would not escape them."""
         for line in lines:
             self.write(line)
 
@@ -71,5 +73,8 @@ def escape_output() -> None:
 
 
 def unescaped_stream(stream: TextIO) -> TextIO:
-    """Return the stream that a `PrintableStream` wraps, for a bar that moves the cursor."""
+    """Return the stream that a `PrintableStream` wraps; another stream is returned as it is.
+
+    A progress bar needs it, because it moves the cursor by control characters.
+    """
     return stream.stream if isinstance(stream, PrintableStream) else stream

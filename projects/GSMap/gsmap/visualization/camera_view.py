@@ -23,10 +23,11 @@ from gsmap.visualization.camera_projection import project_polygon, project_segme
 from gsmap.visualization.style import MapStyle
 
 _STEP_M = 2.0  # largest length of a segment; each is drawn with one depth and one line width
-# Logarithm of the ratio of successive line widths. Widths are rounded to such steps, because all
-# segments of a class with equal widths are drawn together, as one path.
+# Natural logarithm of the ratio of successive line widths. Widths are rounded to such steps,
+# because all segments of a class with equal widths are drawn together, as one path.
 _WIDTH_STEP = 0.2
 _NOMINAL_SIZE_IN = 2.4  # square root of the area of a panel on which line widths are not scaled
+# Arguments of matplotlib for paths without filled area.
 _OPEN_PATHS: dict[str, Any] = {"facecolors": "none", "capstyle": "round", "joinstyle": "round"}
 
 
@@ -67,7 +68,7 @@ class CameraView:
         return width / height
 
 
-Camera = TypeVar("Camera", CameraView, CameraRecord)
+Camera = TypeVar("Camera", CameraView, CameraRecord)  # both have `img_from_frame`
 
 
 def camera_title(name: str) -> str:
@@ -97,7 +98,7 @@ def camera_views(
     for camera in cameras:
         where = f"sample {token!r}, camera {camera.name}"
         try:
-            image = read_image(str(data_root / camera.path), where)[..., ::-1]
+            image = read_image(str(data_root / camera.path), where)[..., ::-1]  # BGR to RGB
         except BrokenSampleError:
             if not grey:
                 raise
@@ -117,13 +118,15 @@ def arrange_cameras(cameras: Sequence[Camera], view: FrameView) -> list[list[Cam
         A row of the cameras that look ahead and a row of the cameras that look back, without
         empty rows.
     """
-    looking_ahead: list[tuple[float, Camera]] = []  # position from the left, camera
+    # Sort key that increases from left to right, and camera.
+    looking_ahead: list[tuple[float, Camera]] = []
     looking_back: list[tuple[float, Camera]] = []
     for camera in cameras:
+        # Angle from straight ahead in (-pi, pi], positive to the left.
         azimuth = viewing_azimuth(camera.img_from_frame, view)
         # The tolerance lets a camera that looks exactly sideways count as looking ahead.
         if abs(azimuth) > np.pi / 2 + 1e-3:
-            # The angle runs from pi / 2 (left) over pi (back) to 3 pi / 2 (right).
+            # In [0, 2 pi), the angle runs from pi / 2 (left) over pi (back) to 3 pi / 2 (right).
             looking_back.append((azimuth % (2 * np.pi), camera))
         else:
             looking_ahead.append((-azimuth, camera))
@@ -138,7 +141,11 @@ def arrange_cameras(cameras: Sequence[Camera], view: FrameView) -> list[list[Cam
 def _draw_areas(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
-    """Fill the areas of closed elements with a faint colour."""
+    """Fill the areas of closed elements with a faint colour.
+
+    `FrameView.lift` adds the height of the ground plane to points. `project_polygon` returns the
+    visible part of an area in pixels, which may be empty.
+    """
     is_closed = np.array([style.is_closed(label) for label in elements.labels])
     closed = elements.select(is_closed)
     shapes = []
@@ -154,7 +161,10 @@ def _draw_areas(
 def _draw_polylines(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
-    """Draw polylines with a dark outline. Lines far away are thinner, but still legible."""
+    """Draw polylines with a dark outline. Lines far away are thinner, but still legible.
+
+    `subdivide` inserts vertices, so that no segment is longer than `_STEP_M`.
+    """
     starts = []
     ends = []
     num_segments = []
@@ -164,26 +174,29 @@ def _draw_polylines(
         ends.append(dense[1:])
         num_segments.append(len(dense) - 1)
     segment_labels = np.repeat(elements.labels, num_segments)
-    segments, depth_m, index = project_segments(
+    # The m visible parts of the segments in pixels (m, 2, 2), the depth of each part, and the index
+    # of its segment.
+    segments, depth_m, segment_index = project_segments(
         np.concatenate(starts),
         np.concatenate(ends),
         img_from_frame=camera.img_from_frame,
         size_px=camera.size_px,
     )
-    box = ax.get_window_extent()
+    box = ax.get_window_extent()  # panel in pixels of the canvas
+    # Side of a square with the area of the panel in inches, relative to the nominal side.
     scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
     nearness = np.log(10 / np.maximum(depth_m, 0.1))  # 0 at 10 m
     # Widths are proportional to depth to the power of -0.6, in steps of _WIDTH_STEP.
     width_level = np.rint(0.6 * nearness / _WIDTH_STEP).astype(int)
     # All segments of one class and one width make one path, so that few paths are drawn.
-    keys = np.c_[segment_labels[index], width_level]
-    kinds, kind_of_segment = np.unique(keys, axis=0, return_inverse=True)
+    pairs = np.c_[segment_labels[segment_index], width_level]  # (m, 2)
+    distinct_pairs, pair_of_segment = np.unique(pairs, axis=0, return_inverse=True)
     paths = []
-    for kind in range(len(kinds)):
-        parts = segments[kind_of_segment == kind]  # (m, 2, 2)
-        codes = [Outline.MOVETO, Outline.LINETO] * len(parts)
-        paths.append(Outline(np.concatenate(parts), codes))
-    width_factors = np.exp(_WIDTH_STEP * kinds[:, 1]).clip(0.45, 2.6)
+    for pair in range(len(distinct_pairs)):
+        path_segments = segments[pair_of_segment == pair]  # (k, 2, 2)
+        codes = [Outline.MOVETO, Outline.LINETO] * len(path_segments)
+        paths.append(Outline(np.concatenate(path_segments), codes))
+    width_factors = np.exp(_WIDTH_STEP * distinct_pairs[:, 1]).clip(0.45, 2.6)
     widths = scale * style.camera_line_pt * width_factors
     outlines = PathCollection(
         paths,
@@ -192,7 +205,7 @@ def _draw_polylines(
         **_OPEN_PATHS,
     )
     lines = PathCollection(
-        paths, edgecolors=style.colours(kinds[:, 0]), linewidths=widths, **_OPEN_PATHS
+        paths, edgecolors=style.colours(distinct_pairs[:, 0]), linewidths=widths, **_OPEN_PATHS
     )
     outlines.set_zorder(4)
     lines.set_zorder(5)
@@ -220,14 +233,17 @@ def draw_camera(
             resampled.
     """
     width, height = camera.size_px
+    # INTER_AREA averages pixels, which is best for a smaller image.
     method = cv2.INTER_AREA if size_px[0] < width else cv2.INTER_CUBIC
     image = cv2.resize(camera.image, size_px, interpolation=method)
+    # The axes keep the pixels of the camera as their unit, so that projected points fit.
     ax.imshow(image, extent=(0, width, height, 0), interpolation="nearest", zorder=1)
     if elements is not None and len(elements):
         _draw_areas(ax, elements, camera=camera, view=view, style=style)
         _draw_polylines(ax, elements, camera=camera, view=view, style=style)
     ax.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
+    # Title in the upper left corner, on a dark plate.
     plate = {"boxstyle": "round,pad=0.3", "facecolor": (0, 0, 0, 0.5), "edgecolor": "none"}
     title = ax.text(0.014, 0.965, camera_title(camera.name), transform=ax.transAxes, zorder=8)
     title.set(fontsize=7, color="white", va="top", bbox=plate)

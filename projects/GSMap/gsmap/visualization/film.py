@@ -34,7 +34,8 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
         RuntimeError: If ``av`` (PyAV) is missing.
     """
     av = import_extra("av", "viz")
-    # The film has a constant rate, from the median period of the pictures.
+    # The film has a constant rate, from the median period of the pictures. One picture alone is
+    # shown for half a second.
     period_s = np.median(np.diff(times_ns)) / 1e9 if len(times_ns) > 1 else 0.5
     period_s = np.clip(period_s, 1 / 60, 10)
     rate = Fraction(1 / period_s).limit_denominator(100)  # pictures per second
@@ -42,7 +43,7 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
         film.metadata["comment"] = "gsmap"
         stream = None
         for picture in pictures:
-            if stream is None:
+            if stream is None:  # the first picture sets the size of the film
                 stream = film.add_stream("libx264", rate=rate, options={"crf": "20"})
                 stream.pix_fmt = "yuv420p"  # every player supports it; sizes must be even
                 height, width, _ = picture.shape
@@ -52,7 +53,7 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
             frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             film.mux(stream.encode(frame))
         if stream is not None:
-            film.mux(stream.encode())
+            film.mux(stream.encode())  # without a frame, it returns the frames that were delayed
 
 
 def write_drive_film(
@@ -75,7 +76,7 @@ def write_drive_film(
     Args:
         path: File to write.
         annotations: Annotation file.
-        results: Result files by their names in the film.
+        results: Result files by their names in the film, at least one.
         scene: Name of the drive; by default the first one of the annotation file.
         data_root: Folder that image paths are relative to; by default the folder of the annotation
             file.
@@ -89,11 +90,12 @@ def write_drive_film(
 
     Raises:
         FileNotFoundError: If a file does not exist.
-        ValueError: If there is no such scene, or a file is malformed or does not fit the others.
+        ValueError: If there is no such scene, a file is malformed or does not fit the others, or an
+            image is missing or damaged.
         RuntimeError: If ``av`` (PyAV) is missing.
     """
     file = AnnotationFile(annotations)
-    scenes = list(dict.fromkeys(file.column("scene")))
+    scenes = list(dict.fromkeys(file.column("scene")))  # without repetition, in their order
     scene = scenes[0] if scene is None else scene
     if scene not in scenes:
         raise InputError(
@@ -102,10 +104,12 @@ def write_drive_film(
         )
     frames_by_result = {}
     for name, result_path in results.items():
+        # One frame for each sample of the annotation file, in the order of scenes and times, with
+        # the predictions and the ground truth. A result file that lacks a sample raises an error.
         result_frames = drive_frames(Path(result_path), file, file.meta.classes)
         frames_by_result[name] = [frame for frame in result_frames if frame.scene == scene]
     row_of_token = {token: row for row, token in enumerate(file.column("token"))}
-    # All results have the samples of the drive.
+    # All results have equal samples in equal order, so the first one gives the rows of the samples.
     first_frames = next(iter(frames_by_result.values()))
     rows = [row_of_token[frame.token] for frame in first_frames[:max_frames]]
     all_times_ns = file.column("timestamp_ns")
@@ -135,8 +139,9 @@ def _draw_frames(
 
     Args:
         file: Annotation file.
-        rows: Indices of the samples of the drive.
-        frames_by_result: Frames of the drive for each result, by the name of the result.
+        rows: Indices of the samples to draw in the annotation file, in the order of time.
+        frames_by_result: Frames of the drive for each result, by the name of the result. The first
+            frames belong to ``rows``; there may be more.
         root: Folder that image paths are relative to, or None to leave cameras out.
         score_thr: Smallest score of a drawn prediction, in [0, 1].
         width_px: Width of the pictures in pixels.
@@ -149,14 +154,15 @@ def _draw_frames(
         panels = []
         for name, frames in frames_by_result.items():
             panels.append(_result_panel(name, frame=frames[index], score_thr=score_thr))
-        elements_over_cameras = panels[0].elements
+        elements_over_cameras = panels[0].elements  # of the first result
         first_frames = next(iter(frames_by_result.values()))  # all have the ground truth
         panels.append(BEVPanel("Ground truth", first_frames[index].truth))
         cameras = []
         if root is not None:
             cameras = camera_views(sample.cameras, root, sample.token)
-        # The axes and the ground plane of the elements' coordinate frame. The sensor's mounting on
-        # the vehicle tilts this plane.
+        # Axes and ground plane of the annotation frame. The plane is needed to project elements
+        # without heights to the images. In the frame of a sensor that is mounted with a tilt, the
+        # ground is tilted, so the plane is computed from the mounting.
         view = frame_view(meta.frame, meta.ground_z_m).with_mounting(sample.ego_from_frame)
         seconds = (sample.timestamp_ns - start_ns) / 1e9
         figure = compose_figure(
@@ -173,7 +179,10 @@ def _draw_frames(
 
 
 def _result_panel(name: str, frame: DriveFrame, score_thr: float) -> BEVPanel:
-    """Panel of the predictions of a result, coloured by track if they have tracks."""
+    """Panel of the predictions of a result, coloured by track if they have tracks.
+
+    Predictions with a score below ``score_thr`` are left out.
+    """
     is_confident = frame.predictions.confidence >= score_thr
     predictions = frame.predictions.select(is_confident)
     if frame.track_ids is None:

@@ -57,7 +57,7 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     """
     summary = ConversionSummary(options.classes)
     target = options.path_of("av2", options.split)
-    split_list = requested_split(options, "av2")
+    split_list = requested_split(options, "av2")  # None for the official split
     if split_list is None:
         identity = OFFICIAL
         log_dirs = find_logs(options.root, options.split, logs=options.logs)
@@ -65,17 +65,21 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
         identity = split_list.identity
         log_dirs = _listed_logs(split_list, options, summary=summary)
     log_dirs = _remove_unfit_logs(log_dirs, options.keep_map_changes, summary=summary)
+    # This may depend on the logs of all shards, so it precedes the choice of the shard.
     excluded_times = _excluded_times(log_dirs, options)
+    # The metadata describe all logs, not only the logs of this shard (part for one of several
+    # machines): shards are merged to one file and must have equal metadata.
     meta = _meta(options, log_dirs, identity=identity)
     log_dirs = options.shard.part(log_dirs)
     jobs = [(log_dir, excluded_times.get(log_dir.name, ())) for log_dir in log_dirs]
-    convert_log = partial(_try_log, options=options)
-    offsets_ns: list[int] = []  # times between a sample and its LiDAR sweep
+    convert_log = partial(_try_log, options=options)  # can be sent to worker processes
+    offsets_ns: list[int] = []  # time between each sample and its LiDAR sweep
     progress = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
     with progress as logs, AnnotationWriter(target, meta, shard=options.shard) as writer:
+        # Results come in the order of the jobs.
         results = ordered_map(convert_log, jobs, workers=_worker_count(options, log_dirs))
         for log_dir, result in zip(logs, results, strict=True):
-            if isinstance(result, str):
+            if isinstance(result, str):  # reason why the log cannot be read
                 summary.add_problem(f"log left out: {result}", log_dir.name)
                 continue
             for sample in result.samples:
@@ -85,7 +89,8 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
                     sweep_ns = int(Path(sample.lidar.path).stem)  # a file is named by its time
                     offsets_ns.append(abs(sweep_ns - sample.timestamp_ns))
             _add_problems(summary, log_dir.name, result=result)
-        if not len(writer) and not options.shard.count:
+        is_whole = not options.shard.count  # a shard may be empty
+        if not len(writer) and is_whole:
             raise WorkError(f"no sample is left for {target}:\n{summary.text()}")
     note = f"{len(offsets_ns)} of {len(writer)} samples have a LiDAR sweep"
     if offsets_ns:
@@ -101,7 +106,21 @@ def _listed_logs(
     """Find the logs of one part of a split list.
 
     All official folders are searched, since published lists mix logs of ``train``, ``val`` and
-    ``test``.
+    ``test``. If listed logs are missing, a note is added to the summary.
+
+    Args:
+        split_list: Names of the logs of each part, such as ``train``.
+        options: Options of the conversion. ``options.split`` is the name of the part.
+        summary: Summary of the conversion.
+
+    Returns:
+        Folders of the logs, sorted by name. If ``options.logs`` is not empty, only the logs whose
+        names begin with one of its entries.
+
+    Raises:
+        FileNotFoundError: If no log remains.
+        ValueError: If the list has no such part, a log is in two parts, or logs of a list that must
+            be complete are missing.
     """
     if options.split not in split_list.scenes:
         raise InputError(
@@ -110,12 +129,14 @@ def _listed_logs(
         )
     log_by_name = {log.name: log for log in find_all_logs(options.root)}
     names = {name: name for name in log_by_name}  # the name of a log is also its token
-    source = options.split_file or f"split {split_list.name!r}"
-    with explain_errors(source, "list each log in one split"):
+    list_title = options.split_file or f"split {split_list.name!r}"
+    with explain_errors(list_title, "list each log in one split"):
+        # Part of each log that the list names, and the listed names that the data set lacks.
         part_by_name, absent = resolve_scenes(split_list.scenes, names)
     listed = set(split_list.scenes[options.split])
     missing = listed.intersection(absent)
     if missing:
+        # Raises an error if the list must be complete and the options do not allow missing logs.
         note = split_list.missing_note(
             missing,
             len(listed),
@@ -174,6 +195,7 @@ def _try_log(job: tuple[Path, Collection[int]], options: Argoverse2Options) -> L
 
 def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -> None:
     """Count the samples, map elements and polygons of a log that are left out."""
+    # An omission is counted by its reason, with the log or the element as an example.
     for reason, count in result.left_out.items():
         summary.add_problem(f"sample left out: {reason}", log_id, count=count)
     for reason, element_ids in result.elements.items():
@@ -214,7 +236,7 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path], identity: str) -
         log_dirs: Folders of all logs of the split.
         identity: Name and digest of the split list, or ``OFFICIAL`` without a list.
     """
-    sizes = {}
+    sizes = {}  # of the maps and tables in bytes, from which the digest of the sources is computed
     for log_dir in log_dirs:
         maps = sorted(log_dir.glob("map/*.json"))
         tables = sorted(log_dir.glob("*.feather"))
@@ -225,6 +247,7 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path], identity: str) -
         "rate_hz": options.rate_hz,
         "compat": options.compat,
     }
+    # The default is not written.
     if options.thin_over != "log":
         choices["thin_over"] = options.thin_over
     choices["num_sweeps"] = options.max_sweeps

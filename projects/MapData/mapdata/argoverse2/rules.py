@@ -19,6 +19,7 @@ def clip_lines(lines: np.ndarray, patch: LocalPatch) -> np.ndarray:
     Returns:
         Pieces of the lines inside the patch, in metres, ego frame. (pieces,)
     """
+    # `lines_inside` clips in the city frame, and `to_frame` transforms to the ego frame.
     return patch.to_frame(patch.lines_inside(lines))
 
 
@@ -34,7 +35,8 @@ def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, 
         of the polygon of each piece (pieces,).
     """
     clipped = shapely.intersection(polygons, patch.polygon)
-    # `owner` is the index of the polygon of each piece.
+    # `owner` is the index of the polygon of each piece. Pieces may also be points or lines, where a
+    # polygon only touches the patch.
     pieces, owner = shapely.get_parts(clipped, return_index=True)
     is_polygon = (shapely.get_type_id(pieces) == POLYGON) & shapely.is_valid(pieces)
     pieces = patch.to_frame(pieces[is_polygon])
@@ -60,14 +62,14 @@ def drop_duplicates(lines: np.ndarray) -> np.ndarray:
     keep = np.ones(len(lines), dtype=bool)
     # The pairs whose first strip is i have the indices starts[i] to starts[i + 1] - 1.
     starts = np.searchsorted(first, np.arange(len(lines) + 1))
-    for i in np.flatnonzero(np.diff(starts)).tolist():
+    for i in np.flatnonzero(np.diff(starts)).tolist():  # strips with at least one pair
         if not keep[i]:
             continue
         others = second[starts[i] : starts[i + 1]]
         others = others[keep[others]]
         overlap = shapely.area(shapely.intersection(strips[i], strips[others]))
         union = area[i] + area[others] - overlap
-        duplicates = others[overlap >= DUPLICATE_IOU * union]
+        duplicates = others[overlap >= DUPLICATE_IOU * union]  # without a division by the union
         keep[duplicates] = False
     return lines[keep]
 
@@ -104,13 +106,15 @@ def merge_until_stable(lines: np.ndarray) -> np.ndarray:
     Returns:
         The joined lines. (m,)
     """
+    # `union_all` cuts lines where they cross or touch. `line_merge` joins lines at places where
+    # exactly two ends meet. A joined line may be cut again, so both are repeated.
     merged = shapely.union_all(lines)
     count = shapely.get_num_geometries(merged)
     while count > 1:
         previous_count = count
         merged = shapely.line_merge(merged)
         count = shapely.get_num_geometries(merged)
-        if count in (1, previous_count):
+        if count in (1, previous_count):  # a single line, or nothing was joined
             break
         merged = shapely.union_all(merged)
         if shapely.get_num_geometries(merged) == 1:

@@ -1,6 +1,8 @@
 """Conversion of the data set, pipeline and schedule of an upstream config to GSMap's settings.
 
-An upstream config belongs to the code that the authors of a model published.
+An upstream config belongs to the code that the authors of a model published. Every setting that is
+converted, or that has no counterpart here, is removed from the config. The caller reports the
+settings that remain.
 """
 
 from typing import Any
@@ -8,25 +10,27 @@ from typing import Any
 from gsmap.utils.errors import InputError
 from mapdata.upstream_configs.fields import Fields
 
+# Classes of data sets that are supported, upstream's names.
 DATASETS = (
     "CustomNuScenesLocalMapDataset", "CustomNuScenesOfflineLocalMapDataset",
     "CustomAV2LocalMapDataset", "CustomAV2OfflineLocalMapDataset",
 )  # fmt: skip
-# pipeline steps that GSMap does elsewhere (migration.md), or that only concern 3D boxes
+# Types of pipeline steps that GSMap does elsewhere (migration.md), or that only concern 3D boxes.
 KNOWN_STEPS = {
     "LoadMultiViewImageFromFiles", "CustomLoadMultiViewImageFromFiles",
     "PhotoMetricDistortionMultiViewImage", "LoadAnnotations3D", "ObjectRangeFilter",
     "ObjectNameFilter", "PadMultiViewImage", "PadMultiViewImageDepth", "DefaultFormatBundle3D",
     "LoadPointsFromFile", "CustomPointToMultiViewDepth",
 }  # fmt: skip
-# settings that annotation files contain, or that only concern history and 3D boxes
+# Names of settings that annotation files contain, or that only concern history and 3D boxes.
 FILE_SETTINGS = (
     "type ann_file map_ann_file classes modality test_mode use_valid_flag bev_size "
     "eval_use_same_gt_sample_num_flag padding_value queue_length box_type_3d samples_per_gpu "
     "load_interval aux_seg fixed_ptsnum_per_line"
 )
-FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # z_cfg of points without heights
-# dotted names of settings in GSMap, by their dotted names in the upstream config
+FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # setting `z_cfg` of points without heights
+# Dotted names of settings in GSMap, by their dotted names in the upstream config. Of the schedulers
+# in `param_scheduler`, 0 is the warm-up and 1 the decay of the learning rate.
 SCHEDULE = {
     "lr_config.warmup_iters": "param_scheduler.0.end",
     "lr_config.warmup_ratio": "param_scheduler.0.start_factor",
@@ -48,11 +52,14 @@ def data_settings(fields: Fields) -> dict[str, Any]:
     Returns:
         Settings by dotted name in GSMap, and further entries for the conversion of the model:
         ``grid`` (``x_range`` and ``y_range``) and ``z_range`` in metres, ``classes``,
-        ``data_root``, ``steps`` (settings of pipeline steps by type) and ``with_depth``.
+        ``data_root``, ``steps`` (settings of GSMap's pipeline steps by type) and ``with_depth``
+        (whether the pipeline collects depth maps).
 
     Raises:
-        ValueError: If the data set is unknown.
+        ValueError: If the data set is unknown, a required setting is missing, or a pipeline is not
+            a list.
     """
+    # This copy keeps the settings that are removed from the config below.
     train = dict(fields.section("data.train"))
     if train.get("type") not in DATASETS:
         raise InputError(
@@ -67,6 +74,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         "classes": classes,
         "model.grid": grid,
         "model.classes": classes,
+        # `take` removes a setting from the config and returns its value.
         "train_dataloader.batch_size": fields.take("data.samples_per_gpu"),
         "train_dataloader.num_workers": fields.take("data.workers_per_gpu"),
         "data_root": data_root,
@@ -79,7 +87,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         "with_depth": False,
     }
     # `drop` removes the settings in `names`. It removes a setting that is given as a keyword only
-    # if it has the given value.
+    # if it has the given value, which is the only value that GSMap supports.
     fields.drop("data", names="shuffler_sampler nonshuffler_sampler")
     for part in ("train", "val", "test"):
         section = f"data.{part}"
@@ -91,15 +99,26 @@ def data_settings(fields: Fields) -> dict[str, Any]:
             section, names=FILE_SETTINGS, pc_range=pc_range, map_classes=classes, z_cfg=FLAT
         )
         if "pipeline" in fields.section(section):
+            # `items` lists the dotted names of the steps, such as `data.train.pipeline.0`.
             for step in fields.items(f"{section}.pipeline"):
                 _convert_step(fields, step, settings=settings)
     return settings
 
 
 def _convert_step(fields: Fields, name: str, settings: dict[str, Any]) -> None:
-    """Convert a pipeline step and add it to ``settings``; unknown steps remain in ``fields``."""
+    """Convert a pipeline step and add it to ``settings``; unknown steps remain in ``fields``.
+
+    Args:
+        fields: Settings of the config. Converted settings are removed from it.
+        name: Dotted name of the step.
+        settings: Settings of GSMap, as `data_settings` returns them; changed in place.
+    """
+    # `step` is a part of the config, not a copy. So `step.clear()` removes the step from the
+    # config.
     step = fields.section(name)
     kind = step.get("type")
+    # This step holds the other steps of a test pipeline. Flipped copies of a sample are not
+    # supported.
     if kind == "MultiScaleFlipAug3D" and not step.get("flip"):
         for inner_step in fields.items(f"{name}.transforms"):
             _convert_step(fields, inner_step, settings=settings)
@@ -134,14 +153,16 @@ def schedule_settings(fields: Fields) -> dict[str, Any]:
         "optim_wrapper.clip_grad": fields.take("optimizer_config.grad_clip", default=None),
         **fields.move(SCHEDULE, required=False),
     }
+    # Upstream has this setting in the optimizer, GSMap beside it.
     if "paramwise_cfg" in optimizer:
         settings["optim_wrapper.paramwise_cfg"] = optimizer.pop("paramwise_cfg")
+    # The number of epochs may be in either place; the runner takes precedence.
     epochs = fields.take("total_epochs", default=None)
     epochs = fields.take("runner.max_epochs", default=epochs)
     if epochs is not None:
         settings["train_cfg.max_epochs"] = epochs
     scale = fields.take("fp16.loss_scale", default=None)
-    if scale is not None:
+    if scale is not None:  # the training used mixed precision
         settings["optim_wrapper.type"] = "AmpOptimWrapper"
         settings["optim_wrapper.loss_scale"] = scale
     fields.drop("lr_config", policy="CosineAnnealing", warmup="linear")

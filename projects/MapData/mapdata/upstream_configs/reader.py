@@ -15,8 +15,9 @@ ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Div: operator.truediv, ast.FloorDiv: operator.floordiv,
 }  # fmt: skip
 _COPIED = 50_000  # limit of copied values and characters, over all uses of earlier names
-_LARGEST = 1e15  # limit of numbers
-_DEEPEST = 20  # limit of nesting
+_LARGEST = 1e15  # limit of the absolute value of computed numbers
+_DEEPEST = 20  # limit of the nesting of copied values
+# Functions that a config may call, in addition to ``dict``.
 CALLS: dict[str, Callable[[Any], Any]] = {"len": len, "list": list, "tuple": tuple}
 
 
@@ -43,7 +44,7 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
         raise InputError(f"{path}, line {error.lineno}: {error.msg}.") from None
     except ValueError as error:  # a zero byte, before Python 3.12
         raise InputError(f"{path}: {error}.") from None
-    except (RecursionError, MemoryError):
+    except (RecursionError, MemoryError):  # Python's parser raises either for deep nesting
         raise InputError(f"{path} cannot be read: it is nested too deep.") from None
     for node in tree.body:
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
@@ -67,7 +68,7 @@ class _Names(dict[str, Any]):
     The total size of the copies is limited, because nested uses of names grow exponentially.
     """
 
-    _remaining = _COPIED
+    _remaining = _COPIED  # size of the copies that may still be made
 
     def copy_of(self, name: str) -> Any:
         """Copy the value of a name.
@@ -86,7 +87,7 @@ class _Names(dict[str, Any]):
         if self._remaining < 0 or depth > _DEEPEST:
             raise InputError("the values of earlier names are too large or nested too deep")
         if isinstance(value, dict):
-            items: Iterable[Any] = (*value, *value.values())
+            items: Iterable[Any] = (*value, *value.values())  # keys and values
         elif isinstance(value, (list, tuple)):
             items = value
         else:
@@ -120,7 +121,7 @@ def _compute(node: ast.expr, names: _Names) -> Any:
         case ast.Call(ast.Name("dict"), [], keywords):
             pairs: list[tuple[ast.expr | None, ast.expr]] = []
             for keyword in keywords:
-                key = ast.Constant(keyword.arg) if keyword.arg else None
+                key = ast.Constant(keyword.arg) if keyword.arg else None  # None: `**` expression
                 pairs.append((key, keyword.value))
             return _mapping(pairs, names)
         case ast.Call(ast.Name(name), [argument], []) if name in CALLS:
@@ -137,6 +138,7 @@ def _compute(node: ast.expr, names: _Names) -> Any:
                 # A repeated string or list may exceed the memory.
                 raise InputError("only numbers can be multiplied")
             result = ARITHMETIC[type(sign)](first, second)
+            # The negation also refuses NaN.
             if isinstance(result, (int, float)) and not abs(result) <= _LARGEST:
                 raise InputError(f"the result is larger than {_LARGEST:g}, the limit of numbers")
             return result

@@ -1,4 +1,9 @@
-"""Conversion of configs of the original MapTR, and of methods built on its code, to our configs."""
+"""Conversion of configs of the original MapTR, and of methods built on its code, to our configs.
+
+The original config becomes a `Fields` object. Converted settings are removed from it, and settings
+that GSMap does not need are dropped. The settings that remain have no counterpart in GSMap and are
+reported.
+"""
 
 import math
 import re
@@ -15,8 +20,9 @@ from gsmap.utils.errors import InputError
 from mapdata.upstream_configs.data import FLAT, data_settings, schedule_settings
 from mapdata.upstream_configs.fields import Fields
 
+# Keys and types of values that may be written to a config, which is executed as Python.
 _KEY = re.compile(r"[a-zA-Z][\w.-]*", re.ASCII)
-_TYPE = re.compile(r"(mmdet\.)?\w+")
+_TYPE = re.compile(r"(mmdet\.)?\w+")  # name of a registered class, and no path of a module
 # Top-level names that configure a run. Other names are variables of the file.
 TOP_LEVEL_NAMES = (
     "_base_", "model", "data", "optimizer", "optimizer_config", "lr_config", "total_epochs",
@@ -34,7 +40,7 @@ _COSTS = f"{_TRAINING}.assigner"
 _TRANSFORMER = f"{_PTS_HEAD}.transformer"
 _ENCODER = f"{_TRANSFORMER}.encoder"
 _PILLARS = f"{_ENCODER}.transformerlayers"
-_SPATIAL = f"{_PILLARS}.attn_cfgs.1"  # after the temporal attention
+_SPATIAL = f"{_PILLARS}.attn_cfgs.1"  # the second attention; the first one is temporal
 _LAYER = f"{_TRANSFORMER}.decoder.transformerlayers"
 # names in GSMap of settings of the model, by name in an original config
 MODEL_NAMES = {
@@ -63,7 +69,8 @@ KINDS: dict[str, tuple[str, ...]] = {
 _SELF_ATTENTIONS = ("MultiheadAttention", "GeometryDecoupledAttention")
 _CROSS_ATTENTIONS = ("CustomMSDeformableAttention",)
 _SPATIAL_ATTENTIONS = ("GeometrySptialCrossAttention", "SpatialCrossAttention")
-# settings that can only have one value in GSMap, by section
+# Settings for which GSMap supports only one value, by section. They are dropped if they have it,
+# and reported otherwise.
 FIXED_VALUES: dict[str, dict[str, Any]] = {
     _PTS_HEAD: {
         "query_embed_type": "instance_pts", "transform_method": "minmax",
@@ -75,7 +82,8 @@ FIXED_VALUES: dict[str, dict[str, Any]] = {
     f"{_SPATIAL}.attention": {"dilation": 1},
     **{section: {"z_cfg": FLAT} for section in (f"{_PTS_HEAD}.bbox_coder", _TRANSFORMER, _COSTS)},
 }  # fmt: skip
-# names of the weights of parts that have no effect if their weight is zero, by section
+# Names of the weights of parts, by section. A part whose weight is zero has no effect and is
+# dropped.
 WEIGHTS = {
     f"{_PTS_HEAD}.loss_bbox": "loss_weight", f"{_PTS_HEAD}.loss_iou": "loss_weight",
     f"{_COSTS}.reg_cost": "weight", f"{_COSTS}.iou_cost": "weight",
@@ -111,7 +119,7 @@ class Conversion:
 
     Args:
         base: Path of the GSMap config to modify, relative to ``configs``.
-        settings: Values by dotted name in GSMap.
+        settings: Values by dotted name in GSMap. A number in a name is an index of a list.
         steps: Settings of the steps of the data pipelines, by type of the step.
         unplaced: Settings without a counterpart in GSMap, each as ``name = value``.
     """
@@ -130,7 +138,9 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
             file. Modified in place.
 
     Raises:
-        ValueError: If the model, one of its parts or the data set is not supported.
+        ValueError: If the model, one of its parts or the data set is not supported, or a required
+            setting is missing. Malformed settings may raise other errors, such as `KeyError` and
+            `TypeError`, which the caller has to catch.
     """
     fields = Fields({name: names[name] for name in TOP_LEVEL_NAMES if name in names})
     models = _entries("models")
@@ -144,20 +154,21 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
     settings |= schedule_settings(fields)
     settings |= _image_settings(fields)
     grid = settings["grid"]
-    sides = (*grid["x_range"], *grid["y_range"])
+    sides = (*grid["x_range"], *grid["y_range"])  # smallest and largest x, then y
     encoder = _encoder_settings(fields, settings, sides=sides)
+    # The functions below read settings that this call and `data_settings` have converted.
     settings |= fields.move(MODEL_NAMES)
     _decoder_settings(fields, settings)
     _head_settings(fields, settings)
     _margin_settings(fields, settings, sides=sides)
     for section, weight in WEIGHTS.items():
-        values = fields.section(section)
+        values = fields.section(section)  # the dict in `fields`, not a copy
         if values.get(weight) == 0:
             values.clear()
     for section in {**IGNORED_NAMES, **FIXED_VALUES}:  # sections of either mapping
         fixed_values = FIXED_VALUES.get(section, {})
         fields.drop(section, names=IGNORED_NAMES.get(section, ""), **fixed_values)
-    has_depth = settings.pop("with_depth")
+    has_depth = settings.pop("with_depth")  # selects the base config and is no setting of GSMap
     # The map of Argoverse 2 has 60 m along x, which is ahead in its frame. The map of nuScenes has
     # 30 m along x.
     is_argoverse2 = sides[0] == -30.0
@@ -196,6 +207,7 @@ def merge(conversion: Conversion, configs: Path) -> Config:
         configs: Folder of the GSMap configs.
     """
     values = Config.fromfile(configs / conversion.base, import_custom_modules=False).to_dict()
+    # The sections on the way to a setting are looked up, and missing ones are created.
     for name, value in conversion.settings.items():
         *sections, key = name.split(".")
         section: Any = values
@@ -206,6 +218,7 @@ def merge(conversion: Conversion, configs: Path) -> Config:
                 section = section.setdefault(section_key, {})
         section[key] = value
     cfg = Config(values)
+    # `steps` has settings for steps of this type in all three pipelines.
     for part in ("train", "val", "test"):
         for step in cfg[f"{part}_dataloader"].dataset.pipeline:
             step.update(conversion.steps.get(step.type, {}))
@@ -214,6 +227,9 @@ def merge(conversion: Conversion, configs: Path) -> Config:
 
 def python_text(cfg: Config) -> str:
     """Format a config as Python source, each value by its ``repr``.
+
+    The text is a config file, which mmengine executes. Values that come from an untrusted file must
+    therefore be plain numbers, texts and containers.
 
     Names with a leading underscore, such as ``_base_``, are left out.
 
@@ -259,7 +275,10 @@ def _check_plain(value: Any, name: str) -> None:
 
 
 def _check_leaf(value: Any, name: str) -> None:
-    """Raise a ``ValueError`` if a value is not None, a finite number or a text of a config."""
+    """Raise a ``ValueError`` if a value is not None, a finite number or a text.
+
+    A text must not have a placeholder of mmengine.
+    """
     if isinstance(value, str):
         if "{{" in value:
             raise InputError(f"{name} is {value!r:.60}, which mmengine would replace")
@@ -297,17 +316,20 @@ def _base_config(encoder: str, model: str, is_argoverse2: bool, has_depth: bool)
         if has_encoder and fits_depth:
             config: str = entry["config"]
             return config.removeprefix("configs/")
+    # `PlainLSSTransform` is a name of this file. The message has the name of the original encoder.
     raise InputError(f"{encoder.removeprefix('Plain')} of {model} is not supported on {data_set}.")
 
 
 def _image_settings(fields: Fields) -> dict[str, Any]:
     """Convert the settings of backbone and neck to settings by dotted name in GSMap."""
     settings: dict[str, Any] = {}
+    # The base configs augment images with GridMask in training. None switches this off.
     if not fields.take("model.use_grid_mask", default=False):
         settings["model.img_augment"] = None
     for part in ("img_backbone", "img_neck"):
         values = fields.take(f"model.{part}", default={})
-        if values["type"] != "VoVNet":  # GSMap registers VoVNet itself
+        # Other backbones and necks are classes of mmdet. GSMap registers VoVNet itself.
+        if values["type"] != "VoVNet":
             values["type"] = f"mmdet.{values['type']}"
         for name, value in values.items():
             settings[f"model.{part}.{name}"] = value
@@ -336,11 +358,13 @@ def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[flo
     pixel_x_m = (x_max - x_min) / columns
     pixel_y_m = (y_max - y_min) / rows
     is_square = abs(pixel_x_m - pixel_y_m) < 1e-6
-    settings[_BEV + "z_range"] = tuple(settings.pop("z_range"))
+    settings[_BEV + "z_range"] = tuple(settings.pop("z_range"))  # from `data_settings`
     settings[_BEV + "bev_pixel_m"] = pixel_x_m if is_square else [pixel_x_m, pixel_y_m]
     if kind == "LSSTransform":
         fields.drop(_ENCODER, names="out_channels feat_down_sample", downsample=2)
         encoder = fields.section(_ENCODER)
+        # The depth network reads camera parameters if it has settings or a loss of depths. Without
+        # them, MapTR's encoder is a plain one.
         reads_cameras = "depthnet_cfg" in encoder or "loss_depth_weight" in encoder
         if fields.section("model").get("type") == "MapTR" and not reads_cameras:
             kind = "PlainLSSTransform"
@@ -368,13 +392,15 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     """Convert the settings of the decoder's attentions and add them to ``settings``."""
     layer = _DECODER + "layer."
     layer_kind = fields.take(f"{_LAYER}.type")
-    # a decoupled layer has a second self-attention with the settings of the first
+    # Dotted names of the attentions. A decoupled layer has a second self-attention with the
+    # settings of the first.
     self_attention, *other_attentions, cross_attention = fields.items(f"{_LAYER}.attn_cfgs")
     _check_kind(fields, self_attention, kinds=_SELF_ATTENTIONS)
     _check_kind(fields, cross_attention, kinds=_CROSS_ATTENTIONS)
     kind = fields.take(f"{self_attention}.type")
     num_heads = fields.take(f"{self_attention}.num_heads")
     settings[layer + "num_heads"] = num_heads
+    # Types of the self-attention in GSMap. `GeometryDecoupledAttention` keeps its name.
     if layer_kind == "DecoupledDetrTransformerDecoderLayer":
         kind = "DecoupledSelfAttention"
     elif kind == "MultiheadAttention":
@@ -385,7 +411,8 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     for attention in other_attentions:
         fields.drop(attention, names="type embed_dims", num_heads=num_heads, dropout=dropout)
     fields.drop(cross_attention, names="type embed_dims num_levels im2col_step")
-    # the original attentions have different default dropouts
+    # The original attentions have different default dropouts. In GSMap, the default is the dropout
+    # of the layer.
     self_dropout = fields.take(f"{self_attention}.dropout", default=0.0)
     cross_dropout = fields.take(f"{cross_attention}.dropout", default=0.1)
     if self_dropout != settings[layer + "dropout"]:
@@ -403,6 +430,7 @@ def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
     def take(name: str, default: Any) -> Any:
         return fields.take(f"{_PTS_HEAD}.{name}", default=default)
 
+    # MapTR has `num_vec`. MapTRv2 has `num_vec_one2one`, and groups for one-to-many matching.
     num_queries = take("num_vec_one2one", default=None) or fields.take(f"{_PTS_HEAD}.num_vec")
     one2many = {
         "name": "one2many",
@@ -415,6 +443,7 @@ def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
         query_groups.append(one2many)
     settings[_HEAD + "query_groups"] = query_groups
     _rendered_mask_settings(fields, settings)
+    # The Euclidean loss of GeMap.
     if take("use_geo_loss", default=False):
         fields.drop(_PTS_HEAD, names="intra_loss_weight inter_loss_weight")
         fields.drop(f"{_PTS_HEAD}.loss_geo", names="type num_ins num_pts pc_range", loss_type="l1")
@@ -425,11 +454,13 @@ def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
             "relation_weight": take("loss_geo.inter_loss_weight", default=1.0),
         }
     aux_heads: list[dict[str, Any]] = []
-    masks = (
+    # Switch and loss of each segmentation in the original head, and its auxiliary head in GSMap.
+    segmentations = (
         ("bev_seg", "loss_seg", "BEVMaskHead"),
         ("pv_seg", "loss_pv_seg", "PVMaskHead"),
     )
-    for flag, loss, kind in masks:
+    for flag, loss, kind in segmentations:
+        # The weights are taken in any case, so that a segmentation that is off leaves no settings.
         mask_head = {
             "type": kind,
             "loss_weight": take(f"{loss}.loss_weight", default=None),
@@ -445,7 +476,13 @@ def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
 
 
 def _rendered_mask_settings(fields: Fields, settings: dict[str, Any]) -> None:
-    """Convert the settings of rendered masks, if the config has them."""
+    """Convert the settings of the losses and costs of rendered masks (MapVR), if there are any.
+
+    Args:
+        fields: Settings of the original config.
+        settings: Converted settings. The weights of the points and the directions are read, and the
+            settings of MapVR's head are added.
+    """
     if not fields.take(f"{_PTS_HEAD}.loss_rendered_mask.type", default=None):
         return
     points_weight = settings[f"{_HEAD}losses.0.loss_weight"]
@@ -478,8 +515,9 @@ def _margin_settings(fields: Fields, settings: dict[str, Any], sides: tuple[floa
         settings: Converted settings, to which the margin is added.
         sides: Smallest and largest x, then y, of the map in metres.
     """
-    # The box of a prediction has two corners. `limits` are the smallest x and y of the first and of
-    # the second corner, then the largest x and y of both.
+    # GSMap has one margin for all sides. In the original config, the box of a prediction has two
+    # corners. `limits` are the smallest x and y of the first and of the second corner, then the
+    # largest x and y of both.
     limits = fields.section(f"{_PTS_HEAD}.bbox_coder").get("post_center_range", ())
     if len(limits) != 8:
         return

@@ -26,6 +26,9 @@ _PERCENTILES = (2.5, 97.5)  # ends of the 95 % interval
 class Interval:
     """95 % confidence interval of a figure (value of a metric), or of a difference of two figures.
 
+    ``UNDEFINED`` (-1) marks ends of an interval that do not exist, because the figure is defined in
+    no resample.
+
     Args:
         value: Figure or difference over all scenes.
         low: 2.5th percentile over the resamples.
@@ -100,6 +103,7 @@ class Resamples:
         num_scenes = len(names)
         probabilities = np.full(num_scenes, fill_value=1 / num_scenes)
         rng = np.random.default_rng(self.seed)
+        # The numbers of copies in a draw with replacement have a multinomial distribution.
         copies = rng.multinomial(num_scenes, pvals=probabilities, size=self.count)
         return scene_index, copies.astype(np.float64)
 
@@ -119,9 +123,13 @@ def _weighted_ap(
         copies: Number of copies of each prediction. (N,)
         ranks: Number of copies of each prediction plus all copies of predictions before it. (N,)
         total: Number of ground truths, each counted as often as it has copies, > 0.
-        interpolated: Whether AP is the mean precision at 101 recalls, instead of the area.
+        interpolated: Whether AP is the mean precision at 101 recalls, instead of the area under
+            the envelope.
+
+    Returns:
+        AP in [0, 1].
     """
-    true_positives = 0.0
+    true_positives = 0.0  # hits down to the current one, first all of them
     for i in hit_rows:
         true_positives += copies[i]
     # Recall points above the recall of all predictions have a precision of 0.
@@ -131,7 +139,7 @@ def _weighted_ap(
     envelope = 0.0
     ap = 0.0
     for i in hit_rows[::-1]:
-        if copies[i] == 0:
+        if copies[i] == 0:  # not in this resample
             continue
         denominator = ranks[i] + _SPACING if interpolated else ranks[i]
         envelope = max(envelope, true_positives / denominator)
@@ -230,6 +238,9 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     Returns:
         AP in each resample (B,) by its flat key, such as ``<metric>/<class>/AP@<threshold>``; NaN
         if it is not defined. Empty for a metric that ranks no predictions.
+
+    Raises:
+        ValueError: If ``resamples`` does not know the scene of a sample.
     """
     if not report.detections:
         return {}
@@ -238,12 +249,15 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     interpolated = not report.by_distance
     class_aps: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}
+    # `ranked` has the predictions of a class by descending score: their matches at each threshold
+    # (``hits``), the indices of their samples, and the number of ground truths of each sample.
     for name, ranked in report.detections.items():
         if report.sample_aps:  # the metric is the mean of AP over the samples
             aps = _mean_of_samples(
                 report.sample_aps[name], scenes=scenes, scene_copies=scene_copies
             )
         else:
+            # Number of ground truths of each scene, as the sum over its samples.
             gts = np.bincount(scenes, weights=ranked.gts_of_sample, minlength=scene_copies.shape[1])
             aps = resampled_aps(
                 ranked.hits,
@@ -260,7 +274,8 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
             figures[f"{name}/AP@{threshold}"] = aps[:, t]
         figures[f"{name}/AP"] = aps.mean(axis=1)
     for group, names in report.groups.items():
-        # AP_chamfer has one group, all classes, whose keys have no prefix.
+        # A group has common thresholds. AP_chamfer has one group, all classes, whose keys have no
+        # prefix.
         prefix = f"{group}/" if interpolated else ""
         means = _mean([class_aps[name] for name in names])
         for t, threshold in enumerate(report.detections[names[0]].thresholds):
@@ -321,6 +336,9 @@ def ap_intervals(reports: Sequence[MetricReport], resamples: Resamples) -> dict[
 
     Returns:
         Intervals by flat key, see `resampled_figures`.
+
+    Raises:
+        ValueError: If the scene of a sample is unknown.
     """
     intervals = {}
     for report in reports:
@@ -345,13 +363,15 @@ def ap_differences(
         Intervals by flat key, for the AP that is defined in both results.
 
     Raises:
-        ValueError: If metrics or samples of the results differ.
+        ValueError: If metrics or samples of the results differ, or the scene of a sample is
+            unknown.
     """
     if _samples_of_metrics(first) != _samples_of_metrics(second):
         raise InputError("two results can be compared only if their samples and metrics are equal.")
     intervals = {}
     for first_report, second_report in zip(first, second, strict=True):
         first_figures = resampled_figures(first_report, resamples)
+        # Equal samples and an equal seed give equal resamples.
         second_figures = resampled_figures(second_report, resamples)
         for key, values in first_figures.items():
             first_value = first_report.metrics[key]

@@ -1,7 +1,8 @@
 """Calibration of Gaussians: whether their sigmas agree with the errors of the vertices.
 
 The vertices are from predictions that AP_chamfer matches. Errors and sigmas are measured along and
-across the line (`gsmap.structures.gaussians.line_errors`).
+across the line (`gsmap.structures.gaussians.line_errors`). A law is the probability distribution of
+the errors that the sigmas describe.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,9 +24,10 @@ AXES = ("along", "across")
 # Limits of the bands of distance from the vehicle: 0 to 10 m, 10 to 20 m, and beyond 20 m.
 DISTANCES_M = (0.0, 10.0, 20.0, np.inf)
 LEVELS = np.linspace(0.05, 0.95, num=19)  # probabilities of central intervals
-_STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))  # both have variance 1
+# Distributions of variance 1, in the order of `LAW_NAMES`: "normal", "laplace".
+_STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))
 LAWS = dict(zip(LAW_NAMES, _STANDARD, strict=True))
-"""Laws of errors (probability distributions) of variance 1, by name."""
+"""Laws of errors of variance 1, by name."""
 # Probabilities that an error of a normal law lies within one and within two sigma.
 COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()
 _FEWEST = 100  # smallest number of vertices of a class for which factors of the class are fitted
@@ -66,21 +68,21 @@ def matched_vertices(samples: Iterable[Sample], config: ChamferConfig) -> Vertic
 
     Args:
         samples: Samples whose predictions have Gaussians.
-        config: Settings of the matching.
+        config: Settings of the matching. Its last threshold is the loosest one.
 
     Raises:
         ValueError: If predictions of a sample have no Gaussians, or no prediction matches.
     """
-    parts: list[Vertices] = []
+    lines: list[Vertices] = []  # vertices of each prediction that matches
     for sample in samples:
-        parts += _vertices_of_sample(sample, config)
-    if not parts:
+        lines += _vertices_of_sample(sample, config)
+    if not lines:
         raise InputError("no prediction matches: there is no vertex to measure.")
     return Vertices(
-        labels=np.concatenate([part.labels for part in parts]),
-        errors=np.concatenate([part.errors for part in parts]),
-        sigmas=np.concatenate([part.sigmas for part in parts]),
-        distances=np.concatenate([part.distances for part in parts]),
+        labels=np.concatenate([line.labels for line in lines]),
+        errors=np.concatenate([line.errors for line in lines]),
+        sigmas=np.concatenate([line.sigmas for line in lines]),
+        distances=np.concatenate([line.distances for line in lines]),
     )
 
 
@@ -107,9 +109,10 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
         span = slice(predictions.offsets[row], predictions.offsets[row + 1])
         points = predictions.points[span, :2]
         line = gt_lines[gt][:, :2]
-        # `orders` are the points of the true line in all equivalent orders: in both directions and,
-        # if the line is closed, from each start. The points of the nearest order are paired with
-        # the points of the prediction.
+        # `orders` has the true line, resampled to the number of predicted points, in all equivalent
+        # orders: in both directions if it is open, and from each start if it is closed. Unused rows
+        # have points far away, which are never nearest. The points of the nearest order are paired
+        # with the points of the prediction.
         orders = equivalent_orders(line, num_points=len(points))
         nearest_order = np.abs(orders - points).sum(axis=(1, 2)).argmin()
         means = torch.tensor(points)
@@ -118,7 +121,8 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
             scales=torch.tensor(predictions.scales[span]),
             rotations=torch.tensor(predictions.rotations[span]),
         )
-        # The error along the line is relative to the paired point, the error across to the line.
+        # The error along the line is measured to the paired point, and the error across it to the
+        # true line.
         target = torch.tensor(orders[nearest_order])
         yield Vertices(
             labels=np.full(len(points), fill_value=predictions.labels[row]),
@@ -138,6 +142,7 @@ def half_widths(law: str, levels: Sequence[float] | FloatArray) -> FloatArray:
     Returns:
         Half widths in units of sigma. (n,)
     """
+    # A central interval of probability p leaves (1 - p) / 2 above it.
     return LAWS[law].ppf((1 + np.asarray(levels)) / 2)
 
 
@@ -193,8 +198,9 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
       Laplace's law.
     * ``sigma_m`` and ``error_m``: mean sigma and mean error in metres.
     * ``reliability_error``: mean gap between the shares of `reliability` and their levels.
-    * ``sparsification_error``: mean gap between the sparsification curves in the order of sigmas
-      and in the order of errors, divided by the mean error.
+    * ``sparsification_error``: mean gap between the curves of `sparsification` in the order of
+      sigmas and in the order of errors, divided by the mean error. It is 0 if the sigmas rank the
+      errors perfectly.
     * ``rank_correlation`` and ``distance_rank_correlation``: rank correlations of sigmas and of
       distances from the vehicle with errors.
 
@@ -203,10 +209,10 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
         law: Law of the errors, one of ``LAWS``.
 
     Returns:
-        Figures by ``along/NAME`` and ``across/NAME``, and ``num_vertices``.
+        Figures by ``along/NAME`` and ``across/NAME``, with the names above, and ``num_vertices``.
     """
     figures: dict[str, float] = {}
-    one, two = half_widths(law, COVERED)
+    half_width_1, half_width_2 = half_widths(law, COVERED)  # in units of sigma
     for axis, name in enumerate(AXES):
         errors = vertices.errors[:, axis]
         sigmas = vertices.sigmas[:, axis]
@@ -216,8 +222,8 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
         log_densities = LAWS[law].logpdf(errors / sigmas)
         values = {
             "nll": (np.log(sigmas) - log_densities).mean(),
-            "coverage@1": (errors <= one * sigmas).mean(),
-            "coverage@2": (errors <= two * sigmas).mean(),
+            "coverage@1": (errors <= half_width_1 * sigmas).mean(),
+            "coverage@2": (errors <= half_width_2 * sigmas).mean(),
             "sigma_m": sigmas.mean(),
             "error_m": errors.mean(),
             "reliability_error": np.abs(reliability(errors, sigmas, law) - LEVELS).mean(),
@@ -243,6 +249,11 @@ def uncertainty_report(
         classes: Names of the classes.
         areas: Names of the classes that are areas; the others are lines.
         law: Law of the errors, one of ``LAWS``.
+
+    Returns:
+        Report with keys such as ``uncertainty/divider/along/nll``, and with the distance
+        ``uncertainty/divider/0-10m/along/nll``. The group ``line`` has all classes that are not
+        areas. A group or a band without vertices has no figures.
     """
     groups: dict[str, list[int]] = {}
     line_labels = []
@@ -252,19 +263,20 @@ def uncertainty_report(
             line_labels.append(label)
     groups["line"] = line_labels
 
-    parts: dict[str, Vertices] = {}
+    subsets: dict[str, Vertices] = {}  # by the middle part of the keys
     for name, labels in groups.items():
         group = vertices.select(np.isin(vertices.labels, labels))
-        parts[name] = group
+        subsets[name] = group
         for low, high in pairwise(DISTANCES_M):
             band = f"{low:g}m+" if high == np.inf else f"{low:g}-{high:g}m"
             in_band = (low <= group.distances) & (group.distances < high)
-            parts[f"{name}/{band}"] = group.select(in_band)
+            subsets[f"{name}/{band}"] = group.select(in_band)
     metrics: dict[str, float] = {}
-    for name, part in parts.items():
-        if len(part.labels):
-            for key, value in uncertainty_figures(part, law).items():
+    for name, subset in subsets.items():
+        if len(subset.labels):
+            for key, value in uncertainty_figures(subset, law).items():
                 metrics[f"uncertainty/{name}/{key}"] = value
+    # `groups` and `detections` concern metrics with an AP.
     return MetricReport(name="uncertainty", groups={}, metrics=metrics, detections={})
 
 
@@ -276,7 +288,7 @@ def format_uncertainty(metrics: Mapping[str, float], law: str = "normal") -> str
         law: Law of the errors, one of ``LAWS``.
     """
     prefix = "uncertainty/"
-    suffix = "/num_vertices"
+    suffix = "/num_vertices"  # each class and each distance band has one key with this suffix
     names = []
     for key in metrics:
         if key.endswith(suffix):
@@ -316,12 +328,12 @@ def fit_factors(
         Factors of the sigmas along and across the line. (classes, 2)
 
     Raises:
-        ValueError: If a class has too few vertices, or ``num_sigmas`` is not in (0, 3].
+        ValueError: If a class has fewer than 100 vertices, or ``num_sigmas`` is not in (0, 3].
     """
     if not 0 < num_sigmas <= 3:
         raise InputError(f"num_sigmas must be in (0, 3], got {num_sigmas}.")
-    covered = 2 * stats.norm.cdf(num_sigmas) - 1
-    width = half_widths(law, covered)
+    covered = 2 * stats.norm.cdf(num_sigmas) - 1  # share of errors that the interval covers
+    half_width = half_widths(law, covered)
     factors = np.empty((len(classes), len(AXES)))
     for label, name in enumerate(classes):
         of_class = vertices.select(vertices.labels == label)
@@ -330,6 +342,8 @@ def fit_factors(
                 f"class {name!r} has {len(of_class.labels)} matched vertices, {_FEWEST} are "
                 "needed: give results of more samples."
             )
+        # The share `covered` of the errors is within this quantile times sigma. After the
+        # correction, it is within `half_width` times the corrected sigma.
         ratios = of_class.errors / of_class.sigmas
-        factors[label] = np.quantile(ratios, covered, axis=0) / width
+        factors[label] = np.quantile(ratios, covered, axis=0) / half_width
     return factors

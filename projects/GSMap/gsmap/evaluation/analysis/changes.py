@@ -19,10 +19,11 @@ NEAR_M = 1.5
 """Largest distance in metres between a found and a true change that match. It is the loosest
 threshold of AP_chamfer."""
 MIN_VIEWS = 5
-"""A point is in view if it is in the range of at least this number of samples."""
+"""A point of a change is in view if it is in the range of at least this number of samples."""
 SHORTEST_M = 5.0
 """A changed line must be found if at least this length of it, in metres, is in view."""
 WANTED_RECALL = 0.6
+"""Recall at which the precision is reported."""
 CHANGED = "changed"
 UNCHANGED = "unchanged"
 
@@ -32,9 +33,10 @@ class Views:
     """Poses of the samples of one map, and the range that each sample covers.
 
     Attributes:
-        frame_from_global: Transforms from the global frame to the samples, in metres. (S, 4, 4)
-        x_range: Smallest and largest x of the range, in metres.
-        y_range: Smallest and largest y of the range, in metres.
+        frame_from_global: Transforms from the global frame to the annotation frames of the S
+            samples, in metres, without height, roll and pitch. (S, 4, 4)
+        x_range: Smallest and largest x of the range in the annotation frame, in metres.
+        y_range: Smallest and largest y of the range in the annotation frame, in metres.
     """
 
     frame_from_global: FloatArray
@@ -66,7 +68,10 @@ class Views:
 
 
 def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
-    """Collect the views of the samples of an annotation file, by the name of their map."""
+    """Collect the views of the samples of an annotation file, by the name of their map.
+
+    The samples of a map are in the order of the file.
+    """
     poses: dict[str, list[FloatArray]] = {}
     for sample in annotations:
         poses.setdefault(sample.map_name, []).append(_level(sample.global_from_frame))
@@ -79,7 +84,7 @@ def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
 
 
 def _level(pose: FloatArray) -> FloatArray:
-    """Remove height, roll and pitch from a pose. (4, 4) -> (4, 4)"""
+    """Remove height, roll and pitch from a pose, since changes are 2D. (4, 4) -> (4, 4)"""
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
     level = np.eye(4)
     level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -90,15 +95,18 @@ def _level(pose: FloatArray) -> FloatArray:
 def with_map_names(
     changes: Iterable[MapChange], map_names: Sequence[str], where: str
 ) -> list[MapChange]:
-    """Complete changes that do not name their map with the name of the only map.
+    """Set the map of changes without the name of a map, if there is only one map.
 
     Args:
-        changes: Changes of a file.
+        changes: Changes of a file. The name of the map is empty if the file does not contain it.
         map_names: Names of the maps of the annotation file.
-        where: Name of the file, for the message.
+        where: Name of the file of changes, for the message.
+
+    Returns:
+        All changes, in their order.
 
     Raises:
-        ValueError: If a change has no name and there are several maps.
+        ValueError: If a change has no name of a map and there are several maps.
     """
     named = []
     for change in changes:
@@ -122,6 +130,9 @@ def changed_samples(changes: Sequence[MapChange], annotations: AnnotationFile) -
 
     Returns:
         ``"changed"`` or ``"unchanged"`` for each sample, by token.
+
+    Raises:
+        ValueError: If a change does not name its map, and the samples are on several maps.
     """
     views = views_by_map(annotations)
     changes = with_map_names(changes, sorted(views), where="the file")
@@ -132,7 +143,7 @@ def changed_samples(changes: Sequence[MapChange], annotations: AnnotationFile) -
     group_of = {}
     for map_name, tokens_of_map in tokens.items():
         points = _points_along([change for change in changes if change.map_name == map_name])
-        for index, token in enumerate(tokens_of_map):  # in the order of the views
+        for index, token in enumerate(tokens_of_map):  # the views have this order, too
             is_changed = views[map_name].contains(index, points).any()
             group_of[token] = CHANGED if is_changed else UNCHANGED
     return group_of
@@ -140,10 +151,10 @@ def changed_samples(changes: Sequence[MapChange], annotations: AnnotationFile) -
 
 def _points_along(changes: Sequence[MapChange]) -> FloatArray:
     """Points at equal steps (`MapChange.samples`) along old and new places of changes. (M, 2)"""
-    points = [np.zeros((0, 2))]
+    points = [np.zeros((0, 2))]  # `np.concatenate` needs an array even without changes
     for change in changes:
         points.append(change.samples())
-        if change.old_points is not None:
+        if change.old_points is not None:  # a moved element
             points.append(replace(change, points=change.old_points).samples())
     return np.concatenate(points)
 
@@ -156,11 +167,14 @@ def change_figures(
 ) -> dict[str, float]:
     """Compute precision and recall of changes.
 
-    A found change is correct if half of its length lies within `NEAR_M` of true changes of equal
-    map, class and kind. A true change counts only if it is in view: at least `SHORTEST_M` of a
-    line, or half of the outline of an area, must be in the range of at least `MIN_VIEWS` samples.
-    Such a change is found if half of its length in view lies within `NEAR_M` of found changes of
-    equal map, class and kind.
+    Precision is the share of the found changes that are correct. A found change is correct if at
+    least half of its length lies within `NEAR_M` of true changes of equal map, class and kind. For
+    this, all true changes count, in view or not.
+
+    Recall is the share of the true changes in view that are found. A true change is in view if at
+    least `SHORTEST_M` of a line, or half of the outline of an area, is in the range of at least
+    `MIN_VIEWS` samples. It is found if at least half of its length in view lies within `NEAR_M` of
+    found changes of equal map, class and kind.
 
     Args:
         found: Changes found by a model.
@@ -169,14 +183,18 @@ def change_figures(
         found_file: File of the found changes, for messages.
 
     Returns:
-        Figures by key. ``precision`` and ``recall`` exist for each kind, for ``all`` kinds, and for
-        ``any_kind``, where kinds need not be equal. They are -1 if there is no change to count.
-        ``num_found`` and ``num_true`` are the numbers of changes of each kind and of all
-        kinds. ``all/precision_at_recall_0.6`` is the largest precision over all confidence
-        thresholds with a recall of at least 0.6; -1 if there is no such threshold.
+        Figures by key, such as ``added/precision``. ``precision`` and ``recall`` exist for the
+        changes of each kind, and for the changes of all kinds together (``all``). In both cases,
+        the kinds of a found and a true change must be equal. For ``any_kind``, they need not be
+        equal, and a found change is also correct at the old place of a moved element. All are -1 if
+        there is no change to count. ``num_found`` and ``num_true`` are the numbers of found changes
+        and of true changes in view, of each kind and of all kinds. The largest precision over all
+        confidence thresholds with a recall of at least 0.6 is ``all/precision_at_recall_0.6``. It
+        is -1 if there is no such threshold.
 
     Raises:
-        ValueError: If the map of a found change is unknown.
+        ValueError: If the map of a found change is unknown, or if a change does not name its map
+            and the samples are on several maps.
     """
     views = views_by_map(annotations)
     found = with_map_names(found, sorted(views), where=str(found_file))
@@ -187,30 +205,32 @@ def change_figures(
             f"{found_file} has a change on the map {unknown[0]!r}, and the samples are on "
             f"{sorted(views)!r:.200}: give the annotation file of its drives."
         )
-    targets = _targets(truth, views)  # the true changes that must be found
+    targets = _targets(truth, views)  # the true changes in view, which must be found
     strict = _Comparison.from_changes(found, truth, targets=targets, same_kind=True)
     loose = _Comparison.from_changes(found, truth, targets=targets, same_kind=False)
     figures: dict[str, float] = {}
     for kind in (*KINDS, "all"):
         is_found_kind = _has_kind(found, kind)
         is_true_kind = _has_kind(list(targets), kind)
-        figures[f"{kind}/precision"] = _mean(strict.hits[is_found_kind])
-        figures[f"{kind}/recall"] = _mean(strict.limits[is_true_kind] >= 0)
+        figures[f"{kind}/precision"] = _share(strict.hits[is_found_kind])
+        figures[f"{kind}/recall"] = _share(strict.limits[is_true_kind] >= 0)
         figures[f"{kind}/num_found"] = float(is_found_kind.sum())
         figures[f"{kind}/num_true"] = float(is_true_kind.sum())
-    best = UNDEFINED
-    for limit in np.unique(strict.confidences):
-        if _mean(strict.limits >= limit) >= WANTED_RECALL:
-            best = max(best, _mean(strict.hits[strict.confidences >= limit]))
-    figures[f"all/precision_at_recall_{WANTED_RECALL}"] = best
-    figures["any_kind/precision"] = _mean(loose.hits)
-    figures["any_kind/recall"] = _mean(loose.limits >= 0)
+    best_precision = UNDEFINED  # -1
+    for threshold in np.unique(strict.confidences):
+        recall = _share(strict.limits >= threshold)
+        if recall >= WANTED_RECALL:
+            precision = _share(strict.hits[strict.confidences >= threshold])
+            best_precision = max(best_precision, precision)
+    figures[f"all/precision_at_recall_{WANTED_RECALL}"] = best_precision
+    figures["any_kind/precision"] = _share(loose.hits)
+    figures["any_kind/recall"] = _share(loose.limits >= 0)
     return figures
 
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Matches of F found changes and T targets, the true changes that must be found.
+    """Matches of F found changes and T targets, the true changes in view that must be found.
 
     Attributes:
         hits: Whether each found change is correct. (F,)
@@ -236,7 +256,7 @@ class _Comparison:
         Args:
             found: Found changes.
             truth: All true changes.
-            targets: Points in view of the true changes that must be found. T x (M, 2)
+            targets: The true changes that must be found, each with its points in view (M, 2).
             same_kind: Whether kinds must be equal.
         """
         hits = np.zeros(len(found), dtype=np.bool_)
@@ -255,18 +275,22 @@ def _has_kind(changes: Sequence[MapChange], kind: str) -> BoolArray:
     return np.array([kind in ("all", change.kind) for change in changes], dtype=np.bool_)
 
 
-def _mean(values: BoolArray) -> float:
-    """Share of values that are True; -1 without values."""
+def _share(values: BoolArray) -> float:
+    """Share of the values that are True; -1 without values."""
     return float(values.mean()) if len(values) else UNDEFINED
 
 
 def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[MapChange, FloatArray]:
-    """True changes that must be found, with their points in view. Each (M, 2)"""
+    """True changes that must be found, each with its points in view (M, 2).
+
+    Changes on maps without samples are left out. `MapChange` is hashed by its identity, so changes
+    with equal values are different keys.
+    """
     targets = {}
     for change in truth:
         if change.map_name not in views:
             continue
-        points = change.samples()  # points in equal steps along the change
+        points = change.samples()  # points at equal steps; none for a change of length 0
         in_view = points[views[change.map_name].count(points) >= MIN_VIEWS]
         # The points are `STEP_M` apart, so lengths are compared as numbers of points.
         least_points = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M
@@ -276,7 +300,10 @@ def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[Map
 
 
 def _is_correct(change: MapChange, truth: Sequence[MapChange], same_kind: bool) -> bool:
-    """Whether half of a found change lies near true changes that it may match."""
+    """Whether at least half of a found change lies near true changes that it may match.
+
+    It is False for a change of length 0, which has no points.
+    """
     lines = []
     for other in truth:
         if _may_match(change, other, same_kind):
@@ -285,6 +312,7 @@ def _is_correct(change: MapChange, truth: Sequence[MapChange], same_kind: bool) 
             if not same_kind and other.old_points is not None:
                 lines.append(shapely.LineString(other.old_points))
     points = shapely.points(change.samples())
+    # Without lines, the union is empty, and no point is near it.
     is_near = shapely.dwithin(points, shapely.union_all(lines), NEAR_M)
     return bool(len(points)) and bool(is_near.mean() >= 0.5)
 
@@ -303,16 +331,18 @@ def _confidence_limit(
         same_kind: Whether kinds must be equal.
     """
     points = shapely.points(in_view)
-    best = np.full(len(points), -1.0)  # largest confidence of the found changes near each point
+    # Largest confidence of the found changes near each point; -1 if none is near.
+    confidences = np.full(len(points), -1.0)
     for change in found:
         if _may_match(target, change, same_kind):
             is_near = shapely.dwithin(points, shapely.LineString(change.points), NEAR_M)
-            best[is_near] = np.maximum(best[is_near], change.confidence)
+            confidences[is_near] = np.maximum(confidences[is_near], change.confidence)
     # The target is found if at least half of its points are near changes that count. The largest
-    # threshold with this property is therefore number `half` of the confidences in falling order.
-    half = -(-len(best) // 2)  # rounded up
-    falling_confidences = np.sort(best)[::-1]
-    return float(falling_confidences[half - 1])
+    # threshold with this property is the confidence of the last of these points, if the points are
+    # sorted by falling confidence.
+    num_half = (len(confidences) + 1) // 2  # half of the number of points, rounded up
+    falling_confidences = np.sort(confidences)[::-1]
+    return float(falling_confidences[num_half - 1])
 
 
 def _may_match(change: MapChange, other: MapChange, same_kind: bool) -> bool:

@@ -1,5 +1,8 @@
 """AP_chamfer of MapTR: nearest ground truth by Chamfer distance, area under the PR curve.
 
+The Chamfer distance of two lines is the mean distance of the points of a line from the nearest
+points of the other line, averaged over both directions.
+
 Rules, equal to MapTR's evaluator:
 
 - Every line is resampled to 100 points.
@@ -33,8 +36,8 @@ from gsmap.evaluation.core.report import MetricReport, distance_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.utils.errors import InputError
 
-CHAMFER_THRESHOLDS = (0.5, 1.0, 1.5)
-HARD_CHAMFER_THRESHOLDS = (0.2, 0.5, 1.0)
+CHAMFER_THRESHOLDS = (0.5, 1.0, 1.5)  # in metres
+HARD_CHAMFER_THRESHOLDS = (0.2, 0.5, 1.0)  # in metres
 STRIP_HALF_WIDTH_M = 2.0
 
 
@@ -53,7 +56,7 @@ def checked_thresholds(thresholds: Sequence[float]) -> tuple[float, ...]:
     try:
         rounded = sorted(round(float(value), ndigits=6) for value in thresholds)
     except (TypeError, ValueError):
-        rounded = []
+        rounded = []  # reported by the next check
     if not (rounded and all(0 < value < math.inf for value in rounded)):  # false for NaN, too
         raise InputError(f"thresholds must be > 0 m, at least one, got {thresholds!r:.80}.")
     return tuple(rounded)
@@ -66,7 +69,7 @@ class ChamferConfig(Metric):
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        thresholds: Largest Chamfer distances of a match, in metres.
+        thresholds: Largest Chamfer distances of a match, in metres; stored in ascending order.
         num_points: Number of points that each line is resampled to.
         resample_predictions: Whether predictions are resampled.
         resample_ground_truth: Whether ground truth is resampled.
@@ -76,10 +79,9 @@ class ChamferConfig(Metric):
         ValueError: If a value is out of its range.
     """
 
-    # `Metric` describes these values.
     name: ClassVar[str] = "chamfer"
-    ranks: ClassVar[bool] = True
-    has_curves: ClassVar[bool] = True
+    ranks: ClassVar[bool] = True  # predictions are ranked over all samples
+    has_curves: ClassVar[bool] = True  # precision-recall curves can be drawn
 
     classes: tuple[str, ...]
     thresholds: tuple[float, ...] = CHAMFER_THRESHOLDS
@@ -89,6 +91,7 @@ class ChamferConfig(Metric):
     dim: int = 2
 
     def __post_init__(self) -> None:
+        # `object.__setattr__` is needed because the dataclass is frozen.
         object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
         object.__setattr__(self, "classes", checked_classes(self.classes))
         if self.num_points < 2:
@@ -127,11 +130,12 @@ class HardChamferConfig(ChamferConfig):
     """AP_chamfer at 0.2, 0.5 and 1.0 m, reported together with AP_chamfer."""
 
     name: ClassVar[str] = "chamfer_hard"
-    companions: ClassVar[tuple[str, ...]] = ("chamfer",)
+    companions: ClassVar[tuple[str, ...]] = ("chamfer",)  # metrics that are reported, too
 
     @classmethod
     def from_settings(cls, settings: MetricSettings) -> "HardChamferConfig":
         """Create the metric from the settings of a command or config, except the thresholds."""
+        # All fields of the usual metric, with other thresholds.
         rules = vars(ChamferConfig.from_settings(settings)) | {
             "thresholds": HARD_CHAMFER_THRESHOLDS
         }
@@ -139,7 +143,12 @@ class HardChamferConfig(ChamferConfig):
 
 
 def _lines(elements: MapElements, config: ChamferConfig, resample: bool) -> kernels.Lines:
-    """Convert the elements of one sample to the input format of the kernels."""
+    """Convert the elements of one sample to the input format of the compiled kernels.
+
+    Returns:
+        Coordinates of the points of all lines in metres (3, M), offsets (N + 1,) and labels (N,).
+        Line i has the points ``offsets[i]:offsets[i + 1]``.
+    """
     points = elements.with_coordinates(config.dim).points  # (M, dim)
     offsets = elements.offsets
     if resample:
@@ -161,7 +170,8 @@ def _line(lines: kernels.Lines, index: int) -> FloatArray:
 
 def _strips_touch(first: FloatArray, second: FloatArray) -> bool:
     """Whether the 4 m wide strips around two lines intersect; ends are flat, corners mitred."""
-    # Fast check: a point of `first` beside a segment of `second` is in the strips of both lines.
+    # Fast check for almost all pairs: a point of `first` beside a segment of `second` is in the
+    # strips of both lines.
     if kernels.beside_a_segment(first, second, STRIP_HALF_WIDTH_M):
         return True
     import shapely  # only a handful of pairs per thousand frames reach this line
@@ -179,13 +189,15 @@ def nearest_by_chamfer(
     config: ChamferConfig,
     max_distance: float = np.inf,
 ) -> tuple[IntArray, FloatArray]:
-    """Find the nearest ground truth of each prediction whose strip touches the prediction's strip.
+    """Find the nearest ground truth of each prediction by Chamfer distance.
+
+    Only ground truths of the class of the prediction count, and only if the strips of both touch.
 
     Args:
         predictions: The N predicted elements.
         ground_truth: The K annotated elements.
         config: Rules of resampling and of heights.
-        max_distance: Largest Chamfer distance in metres.
+        max_distance: Largest Chamfer distance in metres. Farther ground truths are ignored.
 
     Returns:
         Two arrays: index of the ground truth, and its Chamfer distance in metres. Without a ground
@@ -196,7 +208,8 @@ def nearest_by_chamfer(
     """
     pred = _lines(predictions, config, resample=config.resample_predictions)
     gt = _lines(ground_truth, config, resample=config.resample_ground_truth)
-    # (N, K + 1). The last column is infinite, so that argmin exists without ground truth.
+    # Distances (N, K + 1) are infinite for other classes and beyond `max_distance`. The last column
+    # is infinite, so that argmin exists without ground truth.
     distances = kernels.pair_distances(pred, gt=gt, max_distance=max_distance)
     nearest = distances.argmin(axis=1)
     has_candidates = np.isfinite(distances).any(axis=1)
@@ -239,7 +252,8 @@ def _nearest(sample: Sample, config: ChamferConfig) -> tuple[IntArray, FloatArra
         config.resample_ground_truth,
         config.dim,
     )
-    limit = config.thresholds[-1]
+    limit = config.thresholds[-1]  # the loosest threshold
+    # A cached result with a larger limit can be used, because the caller applies the thresholds.
     # Without a cached result, the limit is -inf, so the distances are computed.
     cached_limit, nearest = sample.cache.get(rules, (-np.inf, None))
     if cached_limit < limit:
@@ -252,7 +266,7 @@ def _nearest(sample: Sample, config: ChamferConfig) -> tuple[IntArray, FloatArra
 
 
 def _match(sample: Sample, config: ChamferConfig) -> FrameMatches:
-    """Match the predictions of one sample, as `match_chamfer`, with the cache of the sample."""
+    """Match the predictions of one sample as `match_chamfer` does, with the cache of the sample."""
     token = sample.token
     predictions = sample.predictions
     ground_truth = sample.ground_truth
@@ -262,15 +276,17 @@ def _match(sample: Sample, config: ChamferConfig) -> FrameMatches:
         nearest, distance = _nearest(sample, config)
     except ValueError as error:
         raise InputError(f"sample {token!r}, AP_chamfer of dim {config.dim}: {error}") from error
+    # Indices of the predictions that count, in descending order of score. (n,)
     rows = ranked_predictions(predictions, num_classes=num_classes)
-    # Quality is the negative distance, of the nearest ground truth only. Without a ground truth,
-    # `nearest` is -1 and the infinite distance is written to the additional last column.
+    # `assign` matches in the order of the rows, and prefers the largest quality. Quality is the
+    # negative distance of the nearest ground truth, and -inf for all others. Without a ground
+    # truth, `nearest` is -1 and the infinite distance is written to the additional last column.
     quality = np.full((len(rows), len(ground_truth) + 1), -np.inf)
     quality[np.arange(len(rows)), nearest[rows]] = -distance[rows]
     min_quality = np.tile(np.negative(config.thresholds), reps=(len(rows), 1))
-    matched_gt = assign(quality, thresholds=min_quality)
+    matched_gt = assign(quality, thresholds=min_quality)  # -1 without a match. (n, T)
     is_match = (matched_gt >= 0).any(axis=1)
-    num_gts = (ground_truth.labels == np.arange(num_classes)[:, None]).sum(axis=1)
+    num_gts = (ground_truth.labels == np.arange(num_classes)[:, None]).sum(axis=1)  # (C,)
     return FrameMatches(
         token=token,
         pred_index=rows,
@@ -291,13 +307,19 @@ def chamfer_report(matches: MatchTable, config: ChamferConfig) -> MetricReport:
     Args:
         matches: Matches of all samples by the rules of ``config``.
         config: Rules of the metric. Its name is the prefix of the keys of the figures.
+
+    Returns:
+        Report with keys such as ``chamfer/divider/AP@0.5`` and ``chamfer/mAP``. A mean is 0 if no
+        class has ground truth.
     """
     thresholds = dict.fromkeys(config.classes, config.thresholds)
+    # Predictions of each class, ranked over all samples, with their hits at each threshold. (N, T)
     detections = matches.detections(thresholds)
     metrics: dict[str, float] = {}
-    present = []
+    present = []  # classes with ground truth
     for class_name, ranked in detections.items():
         aps = [area_ap(hits, num_gts=ranked.num_gts) for hits in ranked.hits.T]
+        # The figures are the AP at each threshold and their mean, recalls, distances and counts.
         for key, value in distance_figures(ranked, aps).items():
             metrics[f"{class_name}/{key}"] = value
         if ranked.num_gts:
@@ -306,8 +328,8 @@ def chamfer_report(matches: MatchTable, config: ChamferConfig) -> MetricReport:
     for threshold in config.thresholds:
         keys[f"AP@{threshold}"] = f"AP@{threshold}"
     for mean_key, key in keys.items():
-        aps = [metrics[f"{class_name}/{key}"] for class_name in present]
-        metrics[mean_key] = float(np.mean(aps)) if aps else 0.0
+        class_aps = [metrics[f"{class_name}/{key}"] for class_name in present]
+        metrics[mean_key] = float(np.mean(class_aps)) if class_aps else 0.0
     metrics["num_absent_classes"] = float(len(config.classes) - len(present))
     metrics["num_samples"] = float(len(matches))
     return MetricReport(

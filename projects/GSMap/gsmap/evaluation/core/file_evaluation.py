@@ -36,10 +36,16 @@ Evaluation = tuple[list[MetricReport], list[str]]
 class AnnotatedTruth:
     """Ground truth of an annotation file, with the interface of ``SampleFile``.
 
+    ``SampleFile`` reads ground truth and results in MapTR's JSON form.
+
     Args:
         path: Path of the file.
-        classes: Names of the classes; elements of other classes get the label -1.
+        classes: Names of the classes; elements of other classes get the label -1 and do not count.
         shard: Part of the samples to read.
+
+    Attributes:
+        ignored: Number of elements of each other class in the samples read so far, and number of
+            samples with heights under the key ``THREE_D``.
 
     Raises:
         ValueError: If the file lacks one of the classes or, while iterating, a sample has no ground
@@ -64,7 +70,7 @@ class AnnotatedTruth:
         self.ignored = Counter({THREE_D: len(self._file) if has_heights else 0})
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, int]]:
-        """Yield token, elements and row of each sample."""
+        """Yield token, elements and row of each sample. The row is an argument of `load`."""
         names = self._file.meta.classes
         for row in self._rows:
             sample = self._file[row]
@@ -88,7 +94,7 @@ class AnnotatedTruth:
         return self._file.column("token")
 
     def load(self, _token: str, row: int) -> MapElements:
-        """Read the elements of one sample at random access."""
+        """Read the elements of the sample in a row. ``SampleFile.load`` needs the token, too."""
         return self._elements(self._file[row])
 
     def _elements(self, sample: MapSample) -> MapElements:
@@ -118,6 +124,12 @@ def open_ground_truth(
         path: Annotation file, or ground truth in MapTR's JSON form.
         classes: Names of the classes; elements of other classes get the label -1.
         shard: Part of the samples to read from an annotation file; JSON is read as a whole.
+
+    Returns:
+        Iterable of the token, the elements and the place in the file of each sample.
+
+    Raises:
+        ValueError: If an annotation file lacks one of the classes. JSON is checked while iterating.
     """
     if Path(path).suffix.lower() == ".json":
         return SampleFile(path, key=GROUND_TRUTH_KEY, classes=classes)
@@ -134,7 +146,8 @@ def read_ground_truth(
         classes: Names of the classes; elements of other classes get the label -1.
 
     Returns:
-        Elements of each sample by token, and the number of ignored elements of each other class.
+        Elements of each sample by token, and the number of ignored elements of each other class,
+        with the number of samples with heights under the key ``THREE_D``.
     """
     file = open_ground_truth(path, classes)
     samples = {token: elements for token, elements, _ in file}
@@ -193,6 +206,9 @@ class SamplePairs:
             which the model was trained and tested. If False, a difference raises an error after the
             last pair.
         gaussians: Whether to read the Gaussians of results.
+
+    Raises:
+        ValueError: If an annotation file lacks one of the classes.
     """
 
     def __init__(
@@ -217,7 +233,8 @@ class SamplePairs:
             self._other_shards = set(tokens).difference(shard.part(tokens))
         self._mismatches: list[str] = []
         self._degenerate = 0  # number of ground truths of fewer than two points
-        self._low = np.full(2, np.inf)  # bounds of the ground truth
+        # Smallest and largest x and y of the ground truth in metres.
+        self._low = np.full(2, np.inf)
         self._high = np.full(2, -np.inf)
 
     def __iter__(self) -> Iterator[Sample]:
@@ -227,13 +244,15 @@ class SamplePairs:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file is malformed or the samples differ.
         """
-        # Samples that were read from one file, but not yet from the other. Up to CHUNK of them are
-        # stored with their elements, and further ones with their places in the file.
+        # Samples that were read from one file, but not yet from the other, by token. Up to CHUNK of
+        # them are stored with their elements, and further ones with their places in the file.
         pending_results: dict[str, Any] = {}
         pending_truth: dict[str, Any] = {}
         results = self._items_of_shard(self._results)
         truth = self._items_of_shard(self._truth)
         for result_item, truth_item in zip_longest(results, truth):
+            # An item is None after the end of its file. Otherwise, it has token, elements and
+            # place.
             has_both = bool(result_item) and bool(truth_item)
             if has_both and result_item[0] == truth_item[0]:  # the tokens
                 token, predictions, _ = result_item
@@ -256,18 +275,23 @@ class SamplePairs:
                     is_full = len(pending_truth) >= CHUNK
                     pending_truth[token] = place if is_full else elements
         if isinstance(self._truth, AnnotatedTruth) and not self._allow_other_split:
-            # Raises an error if the model of the results was trained on another split.
+            # Raises an error if the results are from another split, or their model was trained on
+            # another one. `about` is complete only now, after the samples have been read.
             require_results_of(self._truth.split_list, self.about, self._results.path)
         self._mismatches = mismatch_notes(
             pending_results, pending_truth, allowed=self._allow_mismatch
         )
+        # The samples without results that remain, unless `mismatch_notes` has raised an error.
         no_predictions = MapElements.from_polylines()
         for token, pending in pending_truth.items():
             elements = _load(self._truth, token, pending)
             yield self._pair(token, no_predictions, truth=elements)
 
     def _items_of_shard(self, side: Iterable[Any]) -> Iterator[Any]:
-        """Yield token, elements and place of each sample that does not belong to other shards."""
+        """Yield token, elements and place of each sample that does not belong to other shards.
+
+        ``side`` is the file of results or of ground truth.
+        """
         for item in side:
             if item[0] not in self._other_shards:
                 yield item
@@ -374,7 +398,7 @@ def evaluate_files(
         allow_other_split=allow_other_split,
     )
     matches = match_samples(pairs, evaluator, num_workers=num_workers)
-    reports = evaluator.reports(matches)
+    reports = evaluator.reports(matches)  # iterates over the pairs, which completes the notes
     return reports, pairs.notes(evaluator.counts_heights, evaluator.canvas)
 
 
@@ -389,12 +413,13 @@ def match_samples(
         num_workers: Number of processes.
 
     Yields:
-        Records of each sample.
+        Matches of each sample, by the name of the metric.
     """
     with Progress(unit="samples") as bar:
-        for matches in ordered_map(evaluator.match_all, _chunks(pairs), num_workers):
-            yield from matches
-            bar.update(len(matches))
+        # `ordered_map` yields the result of each chunk, in the order of the chunks.
+        for chunk_matches in ordered_map(evaluator.match_all, _chunks(pairs), num_workers):
+            yield from chunk_matches
+            bar.update(len(chunk_matches))
 
 
 def _chunks(pairs: Iterable[Sample]) -> Iterator[list[Sample]]:

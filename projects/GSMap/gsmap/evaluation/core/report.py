@@ -51,6 +51,9 @@ class MetricReport:
             name: Name of the metric.
             figures: Figures by their keys, without the name of the metric.
             tokens: Tokens of the samples, sorted.
+
+        Returns:
+            Report without groups and detections. `format_table` lists its figures in rows.
         """
         metrics = {f"{name}/{key}": float(value) for key, value in figures.items()}
         return cls(name, groups={}, metrics=metrics, detections={}, tokens=tokens)
@@ -86,6 +89,7 @@ def class_figures(
     figures: dict[str, float] = {}
     for t, threshold in enumerate(detections.thresholds):
         hits = detections.hits[:, t]
+        # Mean gap between score and share of matches; -1 without predictions, as `UNDEFINED`.
         error = calibration_error(detections.scores, hits)
         figures[f"AP@{threshold}"] = aps[t]
         figures[f"recall@{threshold}"] = hits.sum() / num_gts if num_gts else absent
@@ -109,6 +113,7 @@ def distance_figures(detections: ClassDetections, aps: Sequence[float]) -> dict[
     """
     figures = class_figures(detections, aps, absent=0.0)
     for t, threshold in enumerate(detections.thresholds):
+        # Under a metric by distance, ``quality`` is the distance of each match in metres.
         errors_m = detections.quality[detections.hits[:, t]]
         figures[f"error_m@{threshold}"] = float(errors_m.mean()) if len(errors_m) else UNDEFINED
     return figures
@@ -140,12 +145,13 @@ def format_table(report: MetricReport) -> str:
 def _group_lines(report: MetricReport, group: str) -> list[str]:
     """Format the table of one group of classes."""
     names = report.groups[group]
-    thresholds = report.detections[names[0]].thresholds
+    thresholds = report.detections[names[0]].thresholds  # equal for all classes of a group
     if report.by_distance:
         unit = "m"
         loosest = thresholds[-1]
         error_title = "error m"
         error_key = f"error_m@{loosest}"
+        # The keys of the means contain no group: "mAP" and "AP@0.5", for example.
         mean_keys = ["mAP"]
         mean_prefix = ""
     else:
@@ -153,6 +159,7 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
         loosest = thresholds[0]
         error_title = "mIoU"
         error_key = "mIoU"
+        # Each group has means, such as "line/AP" and "line/AP@0.5".
         mean_keys = [f"{group}/AP"]
         mean_prefix = f"{group}/"
 
@@ -174,16 +181,18 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
     lines = []
     for name, cells in rows.items():
         line = name.ljust(name_width)
-        for cell, title in zip(cells, titles, strict=False):  # the row of means has AP alone
-            line += cell.rjust(max(len(title), 6) + 2)
+        # The row of means has cells for the AP columns only.
+        for cell, title in zip(cells, titles, strict=False):
+            line += cell.rjust(max(len(title), 6) + 2)  # a figure such as 0.1234 has 6 characters
         lines.append(line)
     last_class_line = lines[-2]  # before the line of the means
-    lines.insert(1, "-" * len(last_class_line))  # below the titles
+    # Below the titles. It is as wide as the row of a class, since the row of means is shorter.
+    lines.insert(1, "-" * len(last_class_line))
     return lines
 
 
 def _cell(report: MetricReport, key: str) -> str:
     """Format one figure; ``-`` if it does not exist."""
     value = report.metrics[f"{report.name}/{key}"]
-    decimals = 0 if "/num_" in key else 4
+    decimals = 0 if "/num_" in key else 4  # numbers of truths and predictions are counts
     return "-" if value == UNDEFINED else f"{value:.{decimals}f}"

@@ -20,20 +20,23 @@ from gsmap.ops.deformable_sampling import (
 from gsmap.structures.tensors import at_least_float32, constant
 from gsmap.utils.errors import InputError
 
-_IM2COL_STEP = 64  # number of samples that mmcv's compiled op processes at a time
-_CORNERS = 4  # cells around a sampling location, which bilinear sampling reads
+_IM2COL_STEP = 64  # number of batch entries that mmcv's compiled op processes at a time
+_CORNERS = 4  # number of cells that bilinear sampling reads around a location
 
 
 def has_compiled_op(value: Tensor) -> bool:
-    """Whether the compiled deformable attention of mmcv supports a tensor."""
+    """Whether the compiled deformable attention of mmcv supports a tensor.
+
+    It must be on a GPU, and mmcv must be compiled for CUDA.
+    """
     return value.is_cuda and get_compiling_cuda_version() != "not available"
 
 
 def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor) -> Tensor:
     """Sample a feature map at several locations per query, and sum the weighted samples.
 
-    The compiled op of mmcv runs if it supports the tensor, unless a kernel of `deformable_sample`
-    is switched on. Otherwise `deformable_sample` runs.
+    The compiled op of mmcv runs if it supports the tensor, unless `deformable_sample` would select
+    its fused kernel. Otherwise `deformable_sample` runs.
 
     Args:
         value: Cells of the map, row by row. (B, H * W, heads, C)
@@ -47,6 +50,7 @@ def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights
     if has_kernel(value) or not has_compiled_op(value):
         return deformable_sample(value, shape, locations, weights)
     # mmcv's op samples several maps (levels). Here it has one level, hence the axes of size 1.
+    # `constant` caches its tensors on the GPU, since new ones would make the host wait.
     level_shapes = constant(value, [shape], torch.long)
     level_starts = constant(value, [0], torch.long)
     return MultiScaleDeformableAttnFunction.apply(
@@ -68,8 +72,8 @@ def place_samples(
         offsets: Offsets (x, y) from the reference point, in cells. (B, Q, heads, S, 2)
         reference: References, which start with the point (x, y), [0, 1] over the map. (B, Q, D)
         shape: Rows and columns of the map.
-        frames: Matrices that multiply the offsets of each query from the left, or None.
-            (B, Q, 2, 2)
+        frames: Matrices that multiply the offsets of each query from the left, such as the axes of
+            its Gaussian; None leaves the offsets as they are. (B, Q, 2, 2)
 
     Returns:
         Locations (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
@@ -77,7 +81,7 @@ def place_samples(
     if frames is not None:
         matrices = frames[:, :, None, None]  # (B, Q, 1, 1, 2, 2)
         offsets = torch.sum(matrices * offsets[..., None, :], -1)  # products of matrix and vector
-    size = constant(offsets, [shape[1], shape[0]])
+    size = constant(offsets, [shape[1], shape[0]])  # cells along x and y
     return reference[:, :, None, None, :2] + offsets / size
 
 
@@ -91,7 +95,7 @@ class SamplingAttention(nn.Module):
         num_heads: Number of heads.
         num_points: Samples per head and query, in each of ``num_parts`` groups.
         query_dims: Channels of the query. None means ``embed_dims``.
-        dropout: Dropout of the output.
+        dropout: Probability of setting a value of the output to zero in training.
         num_parts: Number of groups of samples, for example one group per feature map. All groups
             have equal initial offsets.
 
@@ -128,10 +132,16 @@ class SamplingAttention(nn.Module):
         self.init_weights()
 
     def init_weights(self) -> None:
-        """Initialise offsets in a different direction for each head, and equal weights."""
+        """Initialise the layers.
+
+        Offsets have a different direction for each head, and attention weights are equal. At first,
+        neither depends on the query.
+        """
         constant_init(self.sampling_offsets, 0.0)
         offsets = directional_offsets(self.num_heads, self.num_points // self.num_parts)
-        with torch.no_grad():  # in place, because the weights may be on a GPU
+        # The bias (heads, S, 2) repeats the offsets for each group of samples. It is changed in
+        # place, because it may be on a GPU.
+        with torch.no_grad():
             self.sampling_offsets.bias.copy_(offsets.repeat(1, self.num_parts, 1).flatten())
         constant_init(self.attention_weights, 0.0)
         xavier_init(self.value_proj, distribution="uniform")
@@ -139,6 +149,7 @@ class SamplingAttention(nn.Module):
 
     def offsets_in_cells(self, query: Tensor) -> Tensor:
         """Offsets (x, y) in cells. (B, Q, C) -> (B, Q, heads, S, 2)"""
+        # Under autocast, layers return half precision, which is too coarse for coordinates.
         offsets = at_least_float32(self.sampling_offsets(query))
         return offsets.unflatten(-1, (self.num_heads, self.num_points, 2))
 
@@ -179,7 +190,7 @@ class BEVDeformableAttention(SamplingAttention):
         weights = self.weights(query)
         # Projection and sampling are linear, so either may come first. Sampling first is faster if
         # the heads read fewer cells than the projection of the whole map computes. With a fused
-        # kernel, projection always comes first.
+        # kernel, projection always comes first. Both numbers below count a cell once per head.
         num_cells_read = weights.numel() * _CORNERS
         num_cells_projected = tokens[..., 0].numel() * self.num_heads
         is_fused = has_kernel(tokens) or has_compiled_op(tokens)
@@ -211,15 +222,16 @@ class BEVDeformableAttention(SamplingAttention):
         self, tokens: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
     ) -> Tensor:
         """Sample the unprojected map, then project the sample of each head. (B, Q, C)"""
+        # Indices of the four cells around each location, and their weights. (B, Q, heads, 4 S) each
         cells, cell_weights = bilinear_cells(locations, weights, shape)
         batch_index = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
         # Rows of `table`: the cells of the batch's first map, then of the second one, and so on.
         table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])  # (B * H * W, C)
         rows = batch_index * tokens.shape[1] + cells
-        sampled = sum_rows(table, rows, cell_weights)
+        sampled = sum_rows(table, rows, cell_weights)  # weighted sums of rows. (B, Q, heads, C)
         # If each cell were projected first, its bias would be part of the weighted sum. So the bias
         # is multiplied by the sum of the weights. This sum is less than 1 if a sample lies at the
-        # border of the map.
+        # border of the map or outside of it.
         weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C / heads, C)
         bias = self.value_proj.bias.view(self.num_heads, -1)
         projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)
@@ -258,6 +270,7 @@ class MultiLevelAttention(SamplingAttention):
         Returns:
             The attention output. (B, Q, C)
         """
+        # Axis 3 has the samples of all maps; each map gets its group of them.
         all_offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)
         all_weights = self.weights(query).chunk(self.num_parts, 3)
         total = torch.zeros_like(query)
@@ -281,6 +294,7 @@ def directional_offsets(num_heads: int, num_points: int) -> Tensor:
     """
     angles = torch.arange(num_heads, dtype=torch.float32) * (2 * math.pi / num_heads)
     directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
+    # The larger coordinate becomes 1, which moves the directions from a circle to a square.
     directions = directions / directions.abs().amax(-1, keepdim=True)
     steps = torch.arange(1, num_points + 1, dtype=torch.float32)
     return directions[:, None] * steps[:, None]  # (heads, 1, 2) * (S, 1)

@@ -42,7 +42,7 @@ class Guidance(nn.Module):
 
         Args:
             reference: References. (B, Q, D)
-            feats: Feature map that is sampled, or several maps.
+            feats: Feature map (B, C, H, W) that the cross-attention samples, or several maps.
 
         Returns:
             Matrices that multiply the offsets, column vectors in cells, from the left. None leaves
@@ -57,7 +57,8 @@ class Queries(NamedTuple):
     Attributes:
         state: States of points (B, N * P, C) or instances (B, N, C), or another type that the
             layers of the decoder exchange.
-        position: Positional queries, in the shape of the states of points or instances.
+        position: Positional queries, which attention adds to the states. One for each point
+            (B, N * P, C) or instance (B, N, C).
         reference: References of the points. (B, N * P, D)
     """
 
@@ -84,6 +85,7 @@ class Decoded:
 
     def of_queries(self, queries: slice) -> "Decoded":
         """Select the output of some of the instance queries."""
+        # `vars` also has the fields that a subclass adds.
         fields = {name: values[:, queries] for name, values in vars(self).items()}
         return type(self)(**fields)
 
@@ -98,6 +100,7 @@ class JoinedDecoded(Decoded):
     """
 
     def __init__(self, layers: Sequence[Decoded]) -> None:
+        # `Decoded.__init__` is not called: it would need the concatenated fields at once.
         self._layers = layers
 
     def __getattr__(self, name: str) -> Tensor:
@@ -111,7 +114,8 @@ class JoinedDecoded(Decoded):
 class MapDecoderLayer(BaseModule):
     """Decoder layer: self-attention, cross-attention to the BEV features, feed-forward network.
 
-    Each of the three is followed by LayerNorm.
+    Each of the three is followed by LayerNorm. With guidance, the references of the queries change
+    the positional queries and transform the sampling offsets of the cross-attention.
 
     Args:
         embed_dims: Channels C.
@@ -170,11 +174,12 @@ class MapDecoderLayer(BaseModule):
         Returns:
             The updated states. (B, N * P, C)
         """
-        frames = None
+        frames = None  # matrices that transform the sampling offsets, or None for unchanged offsets
         if self.guidance is not None:
             query_pos = self.guidance.position(query_pos, reference)
             frames = self.guidance.frames(reference, bev_feats)
-        # The self-attention and the feed-forward network add their residual themselves.
+        # The self-attention and the feed-forward network add their residual themselves. The
+        # residual of the cross-attention is added here.
         attended = self.self_attn(query, query_pos, attn_mask)
         query = self.norms[0](attended)
         sampled = self.cross_attn(query + query_pos, reference, bev_feats, frames)
@@ -215,6 +220,7 @@ class MapDecoder(BaseModule):
         check_positive(num_layers=num_layers)
         self.num_points = num_points
         self.detach_reference = detach_reference
+        # Settings in the config of the layer take precedence over these.
         defaults = {"type": self.layer_class, "num_points": num_points, **shared}
         self.layers = ModuleList(build_part(layer, **defaults) for _ in range(num_layers))
         self.branches = list(range(num_layers))
@@ -223,7 +229,8 @@ class MapDecoder(BaseModule):
     def reference_settings(cls, num_points: int) -> dict[str, Any]:
         """Settings of the reference that depend on the decoder. This class has none.
 
-        For example, a decoder in which one instance state refines all P points returns P.
+        For example, a decoder in which the state of an instance refines all P points returns
+        ``{"points_per_state": P}``.
 
         Args:
             num_points: Points per instance P.
@@ -239,7 +246,7 @@ class MapDecoder(BaseModule):
             bev_feats: BEV features. (B, C, H, W)
 
         Returns:
-            States, references and features for the first layer.
+            States, references and features for the first layer. This class returns the inputs.
         """
         return query, reference, bev_feats
 
@@ -248,7 +255,7 @@ class MapDecoder(BaseModule):
         return state
 
     def read(self, state: Any, references: Tensor) -> Decoded:
-        """Create the output of a layer.
+        """Create the output of a layer. The state of an instance is the mean over its points.
 
         Args:
             state: States after the layer.
@@ -294,7 +301,7 @@ class MapDecoder(BaseModule):
         for number, layer in enumerate(self.layers):
             state = layer(state, query_pos, reference, feats, attn_mask)
             reference = refine(number, self.point_states(state), reference)
-            outputs.append(self.read(state, reference))
+            outputs.append(self.read(state, reference))  # with the gradient of the references
             if self.detach_reference:
                 reference = reference.detach()
             if between is not None:

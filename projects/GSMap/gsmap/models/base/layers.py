@@ -27,7 +27,9 @@ def mlp(*dims: int) -> nn.Sequential:
 
 
 def feed_forward(embed_dims: int, ffn_dims: int, dropout: float) -> FFN:
-    """Feed-forward network of mmcv, including the residual. The ReLU is not in place (see `mlp`).
+    """Feed-forward network of mmcv, including the residual.
+
+    The ReLU does not run in place, for the reason that `mlp` gives.
 
     Args:
         embed_dims: Channels of the input and the output.
@@ -48,7 +50,7 @@ def classification_branch(embed_dims: int, num_classes: int) -> nn.Sequential:
     for _ in range(2):
         layers.append(nn.Linear(embed_dims, embed_dims))
         layers.append(nn.LayerNorm(embed_dims))
-        layers.append(nn.ReLU(True))
+        layers.append(nn.ReLU(True))  # in place: LayerNorm returns no view, unlike Linear (`mlp`)
     layers.append(nn.Linear(embed_dims, num_classes))
     return nn.Sequential(*layers)
 
@@ -61,12 +63,12 @@ def resnet_stages(
     The stem halves the resolution of its input, and so does each stage but the first.
 
     Args:
-        block: Class of the blocks.
+        block: Class of the blocks, such as mmdet's ``BasicBlock``.
         inputs: Channels of the input.
         widths: Channels of each stage; the stem has the channels of the first one.
 
     Returns:
-        The stem and the stages.
+        The stem, and the stages, which the caller runs one after the other.
     """
     stem = nn.Sequential(
         nn.Conv2d(inputs, widths[0], kernel_size=7, stride=2, padding=3, bias=False),
@@ -74,11 +76,11 @@ def resnet_stages(
         nn.ReLU(True),
     )
     stages = nn.ModuleList()
-    in_width = widths[0]
-    for width in widths:
-        stride = 2 if len(stages) else 1
-        stages.append(ResLayer(block, in_width, width, num_blocks=2, stride=stride))
-        in_width = width
+    in_channels = widths[0]
+    for channels in widths:
+        stride = 2 if len(stages) else 1  # the first stage keeps the resolution of the stem
+        stages.append(ResLayer(block, in_channels, channels, num_blocks=2, stride=stride))
+        in_channels = channels
     return stem, stages
 
 
@@ -95,14 +97,16 @@ def resize_map(feats: Tensor, shape: Sequence[int]) -> Tensor:
     return F.interpolate(feats, size=tuple(shape), mode="bilinear", align_corners=True)
 
 
-# Ends of the names of matrices that `init_matrices` leaves as they are.
+# Ends of the names of matrices that `init_matrices` leaves as they are, because their modules have
+# initialised them. At first, these layers do not depend on the query.
 _SAMPLING = ("sampling_offsets.weight", "attention_weights.weight", "height_offsets.weight")
 
 
 def init_matrices(module: nn.Module) -> None:
     """Initialise the matrices of a transformer from Xavier's uniform distribution.
 
-    Matrices of sampling offsets and attention weights in deformable attention are left as they are.
+    Weights of convolutions count as matrices, biases and norms do not. The matrices that predict
+    sampling offsets, attention weights and heights in deformable attention are left as they are.
     """
     for name, parameter in module.named_parameters():
         if parameter.dim() > 1 and not name.endswith(_SAMPLING):

@@ -17,7 +17,9 @@ from gsmap.utils.errors import InputError
 
 PartConfig = dict[str, Any]  # type of the config of a part: its settings by name
 WeightConfig = float | Sequence[float]  # type of a weight: one number, or one for each class
-DEFAULTS: Mapping[str, Any] = MappingProxyType({})  # no settings: the part's class has defaults
+# Config without settings, the default of parameters of heads: the part is built with the defaults
+# of its class. (None would switch the part off.) It is read-only, since all heads share it.
+DEFAULTS: Mapping[str, Any] = MappingProxyType({})
 
 
 class AuxHead(Protocol):
@@ -45,7 +47,7 @@ def with_defaults(settings: Mapping[str, Any] | None, **defaults: Any) -> PartCo
     """Config of a part: the given settings, and default values of all other settings.
 
     Args:
-        settings: Given settings, or None.
+        settings: Given settings. None means that no setting is given.
         defaults: Values of settings that are not given.
     """
     return {**defaults, **(settings or {})}
@@ -57,6 +59,9 @@ def build_part(settings: Mapping[str, Any] | None, **defaults: Any) -> Any:
     Args:
         settings: Config of the part, or None.
         defaults: Values of settings that the config does not give, ``type`` included.
+
+    Returns:
+        Object of the class that the setting ``type`` names in the registry ``MODELS``.
     """
     return MODELS.build(with_defaults(settings, **defaults))
 
@@ -70,7 +75,7 @@ def class_of(part: Mapping[str, Any], registry: Registry = MODELS) -> type | Non
         registry: Registry in which names are looked up.
     """
     kind = part.get("type")
-    return registry.get(kind) if isinstance(kind, str) else kind
+    return registry.get(kind) if isinstance(kind, str) else kind  # `get` returns None if unknown
 
 
 def optional_part(
@@ -101,8 +106,11 @@ def set_points_weight(
         parts: Configs of losses or costs.
         kind: Class of the loss or cost of the points. Subclasses do not count.
         weight: New weight. None keeps the configs as they are.
-        key: Name of the setting that is the weight.
+        key: Name of the setting that is the weight, such as ``loss_weight``.
         registry: Registry of the classes of the configs.
+
+    Returns:
+        The configs in their order. The configs in ``parts`` are not changed.
 
     Raises:
         ValueError: If a weight is given and no config has the class.
@@ -110,13 +118,13 @@ def set_points_weight(
     if weight is None:
         return list(parts)
     weighted_parts = []
-    has_points = False
+    has_points_part = False
     for part in parts:
         if class_of(part, registry) is kind:
-            has_points = True
+            has_points_part = True
             part = {**part, key: weight}
         weighted_parts.append(part)
-    if not has_points:
+    if not has_points_part:
         raise InputError(
             f"points_weight is {weight}, but no config has the type {kind.__name__}: add one, or "
             "set points_weight=None."
@@ -157,7 +165,8 @@ def class_weights(weight: WeightConfig, labels: Tensor) -> Tensor:
     Returns:
         The weights in float32. (M,), or () for one weight
     """
-    weights = constant(labels, weight, torch.float32)  # on the device of labels: (), or (classes,)
+    # A cached tensor on the device of the labels, without a wait for the GPU: (), or (classes,)
+    weights = constant(labels, weight, torch.float32)
     return weights[labels] if weights.ndim else weights
 
 

@@ -13,9 +13,12 @@ from gsmap.structures.grid import BEVGrid
 class Reference:
     """Base class of references that can be decoded to points.
 
+    A reference has D entries: the coordinates of a point and, if points are Gaussians, also the
+    parameters of the Gaussian.
+
     Attributes:
         outputs: Names of the fields that `decode` returns.
-        metainfo: Metadata of all predictions.
+        metainfo: Entries that are added to the metainfo of all predictions.
     """
 
     outputs: tuple[str, ...] = ("pts",)
@@ -25,7 +28,7 @@ class Reference:
         """Decode the references of a sample.
 
         Args:
-            references: References. (N, P, D)
+            references: References of N elements with P points each. (N, P, D)
 
         Returns:
             ``pts`` in metres (N, P, 2 or 3), and the other fields of `outputs`. (N, ...)
@@ -36,14 +39,15 @@ class Reference:
 class RefinedReference(Reference):
     """Base class of references that decoder layers refine.
 
-    A reference has D entries. A query has n references: n = 1 for the query of a point, n = P for
-    the query of an instance.
+    Each of Q queries has n references: n = 1 for the query of a point, n = P for the query of an
+    instance.
 
     Attributes:
         coords: Number of coordinates of a point, which are the first entries of a reference: 2 or
             3.
         space: Encoding of Gaussians in references, None for references of points.
-        coder_class: Class of the coder of detections. None means `MapCoder`.
+        coder_class: Class of the coder, which selects detections from the predictions. None means
+            `MapCoder`.
     """
 
     coords: int
@@ -88,14 +92,14 @@ class RefinedReference(Reference):
         raise NotImplementedError
 
     def transform_points(self, points: Tensor, motion: Tensor) -> Tensor:
-        """Transform normalised points and clamp them to the map.
+        """Transform normalised points of an earlier frame and clamp them to the current map.
 
         Args:
-            points: Normalised points. (B, ..., coords)
-            motion: Transform in metres. (B, 4, 4)
+            points: Normalised points of the earlier frame. (B, ..., coords)
+            motion: Transform from the earlier to the current frame, in metres. (B, 4, 4)
 
         Returns:
-            Normalised points. (B, ..., coords)
+            Normalised points of the current frame. (B, ..., coords)
         """
         raise NotImplementedError
 

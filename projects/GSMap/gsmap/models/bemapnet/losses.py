@@ -1,4 +1,8 @@
-"""BeMapNet's losses of one map class: lines, masks, control points, piece counts and curves."""
+"""BeMapNet's losses of one map class: lines, masks, control points, piece counts and curves.
+
+A line is a curve of joined Bezier pieces. Points are (x, y) on the raster of the masks, whose row 0
+is at the front: x is measured from the left, and y from the front.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +19,7 @@ from gsmap.models.bemapnet.curves import neighbourhood, recovery_loss
 from gsmap.models.lines.losses import Case, LineLosses
 from gsmap.utils.errors import InputError
 
+# Names of the matching costs, for messages. Positions 0 and 1 come from `LineLosses.line_costs`.
 COSTS = ("class scores", "masks", "control points", "pieces", "curves", "recovery")
 OVERSAMPLING = 3.0  # random candidates per sampled point of a mask
 UNCERTAIN = 0.9  # share of the sampled points at which the mask is least certain
@@ -66,8 +71,8 @@ class BezierLosses(LineLosses):
             all pixels.
         redrawn_in_px: Whether the targets of the curve loss are in pixels instead of [0, 1] for
             lines whose masks were drawn from their curves, as in the released code. Masks are drawn
-            so for all lines of a class if one of them is completely hidden by others of the class.
-            This setting is used by the head, which creates the targets.
+            from the curves for all lines of a class if one of them is completely hidden by others
+            of the class. This setting is used by the head, which creates the targets.
 
     Raises:
         ValueError: If ``mask_points`` is less than 10.
@@ -122,28 +127,42 @@ class BezierLosses(LineLosses):
     def costs(self, case: Case) -> tuple[Tensor, ...]:
         """Compute the weighted costs of all pairs of a case.
 
+        Args:
+            case: Predicted lines (`BezierLines`) and annotated lines (`TrueCurves`) of one class in
+                one sample, and the distances of their masks.
+
         Returns:
             A tuple of one tensor, with the costs in the order of `COSTS`. (6, n, K)
         """
         lines = case.lines
         truth = case.truth
         num_lines = lines.curves.shape[0]
-        # 25 pixels around each of the 100 points of a curve.
+        # The recovery cost needs the annotated masks at 25 pixels around each of the 100 points of
+        # a predicted curve. The values of all n curves are read from the K masks at once.
         points = neighbourhood(lines.curves, truth.masks.shape[-2:])  # (n, 2500, 2)
         all_points = points.flatten(0, 1)
-        values = point_sample(truth.masks[None], all_points[None])[0]  # (K, n * 2500)
-        values = values.unflatten(1, (num_lines, points.shape[1]))  # (K, n, 2500)
+        mask_values = point_sample(truth.masks[None], all_points[None])[0]  # (K, n * 2500)
+        mask_values = mask_values.unflatten(1, (num_lines, points.shape[1]))  # (K, n, 2500)
         # The inputs (n, 1, P, 2) and (K, P, 2) are broadcast to all pairs, which gives (n, K).
         controls_cost = self.controls * _mean_difference(lines.controls[:, None], truth.controls)
         piece_probs = lines.piece_logits.softmax(dim=-1)  # (n, k)
         pieces_cost = -self.pieces * piece_probs[:, truth.pieces]
         curve_cost = self.curve * _mean_difference(lines.curves[:, None], truth.curves)
-        recovery_cost = self.recovery * recovery_loss(values).T
+        recovery_cost = self.recovery * recovery_loss(mask_values).T  # (n, K)
         curve_costs = torch.stack([controls_cost, pieces_cost, curve_cost, recovery_cost])
         return (torch.cat([self.line_costs(case), curve_costs]),)
 
     def pairs(self, case: Case, costs: list[Tensor]) -> Pairs:
-        """Match a case by its `costs`, on the CPU."""
+        """Match the lines of a case one to one, with the least sum of costs.
+
+        Args:
+            case: Lines of one class in one sample.
+            costs: List of one tensor, the result of `costs` on the CPU. (6, n, K)
+
+        Returns:
+            Indices of the matched lines, on the CPU.
+        """
+        # The names and the token are for the message of an error.
         rows, cols = solve_assignment(costs[0], COSTS, img_meta={"token": case.token})
         return Pairs(rows, cols)
 
@@ -171,9 +190,11 @@ class BezierLosses(LineLosses):
         lines: BezierLines = _concatenate(sample_lines)
         truth: TrueCurves = _concatenate(sample_truths)
         points = neighbourhood(lines.curves, truth.masks.shape[-2:])
-        values = lines.curves[..., 0]  # empty if there is no match, replaced otherwise
-        if len(values):
-            values = point_sample(truth.masks[:, None], points)[:, 0]
+        # Without a match, masks are not sampled, and any empty tensor serves.
+        mask_values = lines.curves[..., 0]
+        if len(mask_values):
+            mask_values = point_sample(truth.masks[:, None], points)[:, 0]  # (M, 2500)
+        # Unused control points are 0 in the targets, so they are set to 0 here.
         controls = lines.controls * lines.control_mask[..., None]
         pieces_loss = F.cross_entropy(lines.piece_logits, truth.pieces, reduction="none")
         line_losses = {
@@ -181,10 +202,10 @@ class BezierLosses(LineLosses):
             "controls": self.controls * _mean_difference(controls, truth.controls),
             "pieces": self.pieces * pieces_loss,
             "curve": self.curve * _mean_difference(lines.curves, truth.curves),
-            "recovery": self.recovery * recovery_loss(values),
+            "recovery": self.recovery * recovery_loss(mask_values),
         }
         losses = {name: value.sum() / divisor for name, value in line_losses.items()}
-        losses["cls"] = self.class_loss(cases, rows)
+        losses["cls"] = self.class_loss(cases, rows)  # over all predictions, matched or not
         return losses
 
 
@@ -194,7 +215,7 @@ def _select(lines: Any, index: Tensor) -> Any:
 
 
 def _concatenate(samples: Sequence[Any]) -> Any:
-    """Concatenate the fields of the tuples of all samples. (M, ...) each"""
+    """Concatenate tuples of all samples field by field. (m, ...) each -> (M, ...) each"""
     return type(samples[0])._make(torch.cat(values) for values in zip(*samples, strict=True))
 
 

@@ -1,4 +1,8 @@
-"""BeMapNet's targets: the control points and the mask of every line."""
+"""BeMapNet's targets: the control points and the mask of every line.
+
+A line is a curve of joined Bezier pieces. Neighbouring pieces share a control point, so k pieces of
+degree d have k * d + 1 control points.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,7 +45,10 @@ class FormatBezierTargets(FormatLineTargets):
         super().__post_init__()
 
     def class_setting(self) -> tuple[str, Sequence[int]]:
-        """Return the name and the values of the setting with one number for each class."""
+        """Return the name and the values of a setting with one number for each class.
+
+        The base class checks the labels of the elements against the number of values.
+        """
         return "degrees", self.degrees
 
     def max_points(self) -> int:
@@ -52,7 +59,7 @@ class FormatBezierTargets(FormatLineTargets):
         return max(counts)
 
     def polyline(self, points: Points, label: int) -> Points:
-        """Return points along the curve that control points define. (P, 2) -> (n, 2)"""
+        """Return points along the curve that control points of a class define. (P, 2) -> (n, 2)"""
         return curve_points(points, self.degrees[label])
 
     def points(self, line: Points, label: int, grid: BEVGrid) -> Points:
@@ -61,28 +68,30 @@ class FormatBezierTargets(FormatLineTargets):
         Args:
             line: Points (from the front, from the left) in [0, 1]. (n, 2)
             label: Class index.
-            grid: Raster of the masks.
+            grid: Raster of the masks, which covers [0, 1]. Its size converts the line to metres.
 
         Returns:
             Control points (from the front, from the left) in [0, 1]. (P, 2)
         """
         if self.sort_rings and is_closed(line):
+            # A ring starts at its rearmost vertex and runs clockwise. The tolerance concerns lines
+            # with two ends.
             line = orient_line(line, tolerance=0.0, sort_rings=True)
-        rows, columns = front_size(grid)
+        rows, columns = front_size(grid)  # pixels along the direction of travel, and across it
         size_m = (rows * self.pixel_m, columns * self.pixel_m)
         degree = self.degrees[label]
         controls = fit_pieces(
             line * size_m,
             degree,
             max_error_m=self.max_error_m,
-            deviation=mean_deviation,
+            deviation=mean_deviation,  # as in the released code
         )
-        first_u = controls[0, 0]
+        first_u = controls[0, 0]  # u is the distance from the front
         last_u = controls[-1, 0]
         if first_u > last_u:  # the line begins at its rear end
             controls = controls[::-1]
-        largest = degree * self.pieces[label] + 1
-        return controls[:largest] / size_m
+        max_controls = degree * self.pieces[label] + 1
+        return controls[:max_controls] / size_m
 
 
 def check_curves(degrees: Sequence[int], pieces: Sequence[int]) -> None:

@@ -19,13 +19,18 @@ def stack_calibration(
 
     Args:
         img_metas: Meta information of the samples, B of them.
-        names: Names of arrays of `gsmap.structures.calibration.calibration_arrays`.
+        names: Names of arrays of `gsmap.structures.calibration.calibration_arrays`, such as
+            ``img_from_frame``.
         device: Device of the result.
 
     Returns:
-        A tensor for each name. (B, ...)
+        A tensor for each name. (B, V, 4, 4), or (B, 18) for ``can_bus``
+
+    Raises:
+        ValueError: If a sample lacks a field, or the samples differ in the number of cameras.
     """
     stacks = [torch.from_numpy(stack) for stack in stack_calibration_arrays(img_metas, names)]
+    # `upload` copies all stacks at once, without waiting for a GPU.
     return dict(zip(names, upload(stacks, device), strict=True))
 
 
@@ -33,7 +38,8 @@ class CameraEncoder(BaseModule):
     """Base class of BEV encoders of camera features.
 
     Attributes:
-        calibration: Names of the arrays that the encoder reads, see `stack_calibration`.
+        calibration: Names of the calibration arrays that the encoder reads, see
+            `stack_calibration`. A subclass sets them.
         num_levels: Number of levels of image features that are used, the finest first; None for
             all levels.
     """
@@ -59,11 +65,11 @@ class CameraEncoder(BaseModule):
         """
         calibration = stack_calibration(img_metas, self.calibration, mlvl_feats[0].device)
         feats = self.levels(mlvl_feats)
-        img_shape = img_metas[0]["batch_input_shape"]
+        img_shape = img_metas[0]["batch_input_shape"]  # equal for all samples of a batch
         return self.encode(feats, calibration, img_shape)
 
     def levels(self, mlvl_feats: Sequence[Tensor]) -> Any:
-        """Select the levels that `encode` takes: the first one, or a list of the first ones."""
+        """Select the levels that `encode` takes: one tensor for one level, otherwise a list."""
         if self.num_levels == 1:
             return mlvl_feats[0]
         return list(mlvl_feats[: self.num_levels])

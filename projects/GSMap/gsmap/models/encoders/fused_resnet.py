@@ -34,6 +34,9 @@ class Convolve(Protocol):
             x: Input. (n, C, h, w)
             identity: Residual in the shape of the output, or None.
             relu: Whether the ReLU is applied.
+
+        Returns:
+            Output. (n, D, h', w')
         """
         ...
 
@@ -51,11 +54,13 @@ def fused_resnet(backbone: ResNet, images: Tensor, convolve: Convolve) -> tuple[
     """
     x = backbone.maxpool(convolve(backbone.conv1, backbone.norm1, images))
     feats = []
+    # `res_layers` has the attribute names of the stages.
     for index, name in enumerate(backbone.res_layers):
         for block in getattr(backbone, name):
             identity = x
             if block.downsample is not None:
-                *pooling, conv, norm = block.downsample  # variants of ResNet pool first
+                # The shortcut is a convolution with its norm. Variants of ResNet pool first.
+                *pooling, conv, norm = block.downsample
                 for layer in pooling:
                     identity = layer(identity)
                 identity = convolve(conv, norm, identity, relu=False)
@@ -71,7 +76,11 @@ def fused_resnet(backbone: ResNet, images: Tensor, convolve: Convolve) -> tuple[
 
 
 def is_plain(backbone: nn.Module) -> bool:
-    """Whether a backbone is a ResNet of plain blocks, which `fused_resnet` requires."""
+    """Whether a backbone is a ResNet of plain blocks, which `fused_resnet` requires.
+
+    A plain block has no plugins, deformable convolutions (``dcn``) or gradient checkpointing. The
+    stem must be a single convolution.
+    """
     if not isinstance(backbone, ResNet):
         return False
     has_extras = backbone.deep_stem or backbone.plugins is not None or backbone.dcn is not None
@@ -79,6 +88,7 @@ def is_plain(backbone: nn.Module) -> bool:
         return False
     for name in backbone.res_layers:
         for block in getattr(backbone, name):
+            # Subclasses of the blocks may compute something else, so they do not count.
             # ``with_cp`` is mmdet's name of gradient checkpointing.
             if type(block) not in (BasicBlock, Bottleneck) or block.with_cp:
                 return False
@@ -96,7 +106,7 @@ def convolve_folded(
 
     Args:
         conv: The convolution, with the batch norm folded into its weights.
-        norm: Not used.
+        norm: Not used, since the weights include it.
         x: Input. (n, C, h, w)
         identity: Residual in the shape of the output, or None.
         relu: Whether the ReLU is applied.
@@ -116,7 +126,8 @@ class FrozenNorms:
     """
 
     def __init__(self) -> None:
-        # Scale and shift of norms without gradients, with the versions of the norm's tensors.
+        # For each norm without gradients: versions of its tensors (`tensor_versions`), scale and
+        # shift. The versions show whether the tensors have changed since.
         self._constants: dict[nn.Module, tuple[list[tuple[int, int]], Tensor, Tensor]] = {}
 
     def __call__(self, backbone: ResNet, images: Tensor, dtype: torch.dtype) -> tuple[Tensor, ...]:
@@ -130,6 +141,7 @@ class FrozenNorms:
         Returns:
             One map per output level, of type ``dtype``. (n, C, h, w) each
         """
+        # Autocast would choose other types than ``dtype``.
         with torch.autocast(images.device.type, enabled=False):
             return fused_resnet(backbone, images.to(dtype), convolve=self._convolve)
 
@@ -170,7 +182,11 @@ class FrozenNorms:
 
 
 def has_frozen_norms(backbone: nn.Module | None) -> bool:
-    """Whether `FrozenNorms` can replace the forward pass of a backbone in its present state."""
+    """Whether `FrozenNorms` can replace the forward pass of a backbone in its present state.
+
+    It cannot if a batch norm is in training mode, or if a module has hooks, which `FrozenNorms`
+    would not call. It is not used under ``torch.compile``.
+    """
     if backbone is None or not is_plain(backbone) or torch.compiler.is_compiling():
         return False
     for module in backbone.modules():
@@ -231,14 +247,14 @@ class _ConvolveReLU(torch.autograd.Function):
             grad,
             x,
             weight,
-            [len(weight)],  # shape of the bias
+            [len(weight)],  # shape of the bias: one value per output channel
             transposed=False,
             output_padding=[0, 0],
-            output_mask=list(needed[:3]),
+            output_mask=list(needed[:3]),  # whether x, weight and bias need a gradient
             **ctx.geometry,
         )
-        identity_grad = grad if needed[3] else None
-        return x_grad, weight_grad, bias_grad, identity_grad, None
+        identity_grad = grad if needed[3] else None  # the residual is added, so the factor is 1
+        return x_grad, weight_grad, bias_grad, identity_grad, None  # none for `geometry`
 
 
 def _convolve_relu(

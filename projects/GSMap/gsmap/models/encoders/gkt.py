@@ -1,4 +1,8 @@
-"""Geometry-guided kernel attention (GKT): BEV cells attend to a kernel of pixels in each image."""
+"""Geometry-guided kernel attention (GKT): BEV cells attend to a kernel of pixels in each image.
+
+A kernel is the small window of pixels around the projection of a cell. (A compiled GPU function is
+called "Triton kernel" below.)
+"""
 
 import torch
 from mmdet3d.registry import MODELS
@@ -31,18 +35,20 @@ def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
 class GeometryKernelAttention(nn.Module):
     """Attention from BEV cells to the pixels around their projections, one pillar height per head.
 
-    A cell attends to the cameras in which it is visible, and the output is the mean over these
-    cameras.
+    A cell is visible in a camera if the projection of any height of its pillar lies in the image.
+    It attends to these cameras with all heads, and the output is the mean over the cameras.
 
     Args:
         embed_dims: Channels C.
         num_heads: Number of heads; head m attends to pillar height m.
         kernel_size: Rows and columns of the kernel, odd unless ``bilinear``. The centre of a kernel
-            with an even size lies half a pixel to the left of the projection, or above it.
+            with an even number of columns lies half a pixel to the left of the projection. With an
+            even number of rows, it lies half a pixel above the projection.
         bilinear: Interpolate between pixels, which are zero outside the map, instead of rounding
             to the nearest pixel.
-        released_cells: Use the visible cells of the first sample of the batch for all samples, as
-            in the released code. The result of a sample then depends on its batch.
+        released_cells: In all samples of a batch, a cell attends to the cameras in which it is
+            visible in the first sample, as in the released code. The result of a sample then
+            depends on its batch.
         equal_weights: Initialise to equal weights over the kernel, as GKT's code intends. In MapTR
             and its successors the weights start from Xavier's distribution, because their
             transformer initialises all matrices once more, after this module.
@@ -53,8 +59,9 @@ class GeometryKernelAttention(nn.Module):
     """
 
     offsets: Tensor
-    # True for CUDA graphs, in which the sizes of tensors must not depend on values. All pairs of a
-    # cell and a camera are then computed, with weight 0 where the cell is not visible.
+    # The code that captures CUDA graphs sets this to True, because in a graph the sizes of tensors
+    # must not depend on values. All pairs of a cell and a camera are then computed, with weight 0
+    # where the cell does not attend to the camera.
     fixed_sizes = False
 
     def __init__(
@@ -104,13 +111,15 @@ class GeometryKernelAttention(nn.Module):
         Args:
             query: Queries of the cells. (B, Q, C)
             img_feats: Image features. (B, V, C, h, w)
-            projection: Image coordinates of pillars with one point per head.
+            projection: Image coordinates of the pillars, with one point per head (``uv``), and the
+                cameras in which each cell is visible (``visible``).
 
         Returns:
             Camera features of every cell. (B, Q, C)
         """
         height, width = img_feats.shape[-2:]
         value = self.value_proj(img_feats.flatten(3).transpose(2, 3))  # (B, V, h * w, C)
+        # The softmax is computed in float32, also under autocast.
         logits = self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1))
         weights = logits.softmax(-1)  # (B, Q, heads, S)
         visible = projection.visible
@@ -118,10 +127,11 @@ class GeometryKernelAttention(nn.Module):
         if self.released_cells:
             pairs = visible[:1].expand_as(visible)
         shape = (height, width)
-        # `sample_kernels` has tensors of fixed sizes, with all pairs. Without its Triton kernel
-        # (`has_kernel`), it is cheaper to compute the visible pairs alone.
+        # Both branches compute equal sums. `sample_kernels` computes all pairs of a cell and a
+        # camera, so the sizes of its tensors are fixed. If it has no Triton kernel for these
+        # features (`has_kernel`), computing only the pairs that attend is cheaper.
         if self.fixed_sizes or has_kernel(value):
-            maps = value.unflatten(-1, (self.num_heads, -1))
+            maps = value.unflatten(-1, (self.num_heads, -1))  # (B, V, h * w, heads, C / heads)
             head_sums = sample_kernels(
                 maps,
                 shape,
@@ -133,24 +143,25 @@ class GeometryKernelAttention(nn.Module):
             )
             summed = head_sums.flatten(2)
         else:
+            # The sums are in float32, as in `sample_kernels`.
             summed = self._sum_pairs(
                 value.float(), shape=shape, uv=projection.uv, pairs=pairs, weights=weights
             )
-        # Number of cameras in which a cell is visible. It is counted for each sample, even with
-        # `released_cells`. (B, Q)
+        # Number of cameras in which a cell is visible, at least 1. It is counted in each
+        # sample, even if the pairs come from the first sample (`released_cells`). (B, Q)
         count = visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])
 
     def _sum_pairs(
         self, value: Tensor, shape: tuple[int, int], uv: Tensor, pairs: Tensor, weights: Tensor
     ) -> Tensor:
-        """Sum pixels of kernels over cameras like `sample_kernels`, but for visible pairs only.
+        """Sum pixels of kernels over cameras like `sample_kernels`, but only for the given pairs.
 
         Args:
             value: Projected image features. (B, V, h * w, C)
             shape: Rows h and columns w of the feature maps.
-            uv: Projection (x, y) of each cell for each head, [0, 1] over the image.
-                (B, V, Q, heads, 2)
+            uv: Projection (x, y) of each cell for each head, [0, 1] over the image where the cell
+                is visible. (B, V, Q, heads, 2)
             pairs: True where a cell attends to a camera. (B, V, Q)
             weights: Attention weights of the S pixels of the kernel. (B, Q, heads, S)
 
@@ -159,19 +170,22 @@ class GeometryKernelAttention(nn.Module):
         """
         batch, num_queries = weights.shape[:2]
         num_views, num_pixels = value.shape[1:3]
-        sample, view, cell = pairs.nonzero(as_tuple=True)  # (T,) each, for T visible pairs
+        sample, view, cell = pairs.nonzero(as_tuple=True)  # (T,) each, for T pairs
+        # Row-major indices of the pixels of each kernel in its feature map, and their weights. With
+        # `bilinear`, each of the S points has four pixels, so S below is four times as large.
         pixels, pair_weights = kernel_pixels(
             uv[sample, view, cell],
             self.offsets,
             weights=weights[sample, cell],
             shape=shape,
             bilinear=self.bilinear,
-        )  # (T, heads, S)
+        )  # (T, heads, S) both
         image = (sample * num_views + view).view(-1, 1, 1)
         head = torch.arange(self.num_heads, device=value.device).view(1, -1, 1)
-        # A row has the channels of one head of one pixel of one image.
+        # One row for each image, pixel and head, with the channels of the head.
         value_rows = value.reshape(-1, value.shape[-1] // self.num_heads)
         row_index = (image * num_pixels + pixels) * self.num_heads + head  # (T, heads, S)
+        # `sum_rows` sums the S rows of each pair and head, multiplied by their weights.
         pair_sums = sum_rows(value_rows, row_index, pair_weights).flatten(1)  # (T, C)
         cell_index = sample * num_queries + cell
         summed = pair_sums.new_zeros(batch * num_queries, pair_sums.shape[-1])

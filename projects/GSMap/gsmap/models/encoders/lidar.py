@@ -20,17 +20,19 @@ from gsmap.utils.errors import WorkError
 class LidarEncoder(BaseModule):
     """Encoder from LiDAR voxels to BEV features: PointPillars or SECOND, depending on its modules.
 
-    The data preprocessor makes the voxels (``voxel=True``). Their range must be the extent of the
-    map.
+    The data preprocessor makes the voxels (``voxel=True``). The range of the voxels must be the
+    extent of the map.
 
     Args:
         grid: Extent of the map.
-        voxel_encoder: Config of the module that encodes the points of each voxel.
-        middle_encoder: Config of the module that scatters voxels to the BEV plane.
-        backbone: Config of the 2D backbone, or None.
-        neck: Config of the neck, or None; its first output is used.
+        voxel_encoder: Config of the module that encodes the points of each voxel to one feature.
+        middle_encoder: Config of the module that scatters the features of the voxels to the BEV
+            plane.
+        backbone: Config of the 2D backbone, or None to leave it out.
+        neck: Config of the neck, or None to leave it out.
         bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y. The
             features are interpolated to these cells.
+        init_cfg: Config of the initial weights, see mmengine's ``BaseModule``.
     """
 
     def __init__(
@@ -48,7 +50,7 @@ class LidarEncoder(BaseModule):
         self.middle_encoder = MODELS.build(middle_encoder)
         self.backbone = MODELS.build(backbone) if backbone else None
         self.neck = MODELS.build(neck) if neck else None
-        cells = grid.rasterized(bev_pixel_m)
+        cells = grid.rasterized(bev_pixel_m)  # the extent, divided into cells of this size
         self.bev_size = (cells.height, cells.width)
 
     def forward(self, voxels: dict[str, Tensor], batch_size: int) -> Tensor:
@@ -64,7 +66,8 @@ class LidarEncoder(BaseModule):
             BEV features, row 0 at the smallest y. (B, C, H, W)
 
         Raises:
-            RuntimeError: If a sparse encoder runs on the CPU without spconv, or trains on the CPU.
+            RuntimeError: If a sparse encoder (SECOND) runs on the CPU without spconv, or trains on
+                the CPU. The class is `WorkError`.
         """
         coors = voxels["coors"]
         if isinstance(self.middle_encoder, SparseEncoder) and not coors.is_cuda:
@@ -78,11 +81,12 @@ class LidarEncoder(BaseModule):
                     "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without "
                     "them use a PointPillars config."
                 )
-        points = self.voxel_encoder(voxels["voxels"], voxels["num_points"], coors)
-        feats = self.middle_encoder(points, coors, batch_size)
-        for part in (self.backbone, self.neck):
-            if part is not None:
-                feats = part(feats)
+        voxel_feats = self.voxel_encoder(voxels["voxels"], voxels["num_points"], coors)  # (M, c)
+        feats = self.middle_encoder(voxel_feats, coors, batch_size)
+        for module in (self.backbone, self.neck):
+            if module is not None:
+                feats = module(feats)
+        # Backbones and necks may return several maps, of which the first is used.
         if isinstance(feats, (list, tuple)):
             feats = feats[0]
         if feats.shape[-2:] != self.bev_size:
@@ -98,7 +102,8 @@ class ConvFuser(ConvModule):
         camera_channels: Channels of the camera features.
         lidar_channels: Channels of the LiDAR features.
         out_channels: Channels of the output.
-        kwargs: Further arguments of ``mmcv.cnn.ConvModule``.
+        kwargs: Further arguments of ``mmcv.cnn.ConvModule``. By default, it is a 3x3 convolution
+            without bias, followed by BatchNorm and ReLU.
     """
 
     def __init__(

@@ -88,14 +88,17 @@ class GSMapHead(MapHead):
             min_scale_m=min_scale_m,
             init_scales_m=(initial_along_m, initial_across_m),
         )
+        # The configs are copied, and the weight of the loss and of the cost of points is replaced.
         losses = set_points_weight(losses, PointsLoss, weight=points_weight, key="loss_weight")
         match_costs = set_points_weight(
             match_costs,
             OrderedPointsCost,
             weight=points_weight,
             key="weight",
-            registry=TASK_UTILS,
+            registry=TASK_UTILS,  # of the matching costs; losses are in MODELS
         )
+        # `add_guidance` copies the config and conditions the layers on the Gaussians.
+        # `optional_part` returns a list of one config, or an empty list for None.
         super().__init__(
             grid=grid,
             decoder=add_guidance(decoder),
@@ -109,7 +112,7 @@ class GSMapHead(MapHead):
         self.temperatures = temperatures
 
     def check_temperatures(self, temperatures: Sequence[Sequence[float]] | None) -> None:
-        """Raise ValueError if temperatures are not two positive numbers for each class."""
+        """Raise ``ValueError`` if temperatures are neither None nor two numbers > 0 per class."""
         if temperatures is None:
             return
         is_valid = len(temperatures) == len(self.classes)
@@ -126,23 +129,25 @@ class GSMapHead(MapHead):
         """Fields of the detections, with sigmas multiplied by the temperatures.
 
         Args:
-            fields: Decoded references, by name. (N, ...) each
+            fields: Decoded references of the N queries: ``pts``, ``scales`` (sigmas in metres) and
+                ``rotations``. (N, P, ...) each
             best: Selected pairs of query and class.
 
         Returns:
-            The fields by name. (M, ...) each
+            The fields of the M selected pairs, by name. (M, P, ...) each
         """
         detections = super().select_detections(fields, best)
         if self.temperatures is None:
             return detections
         # A detection is stretched along and across the line, by the temperatures of its class.
+        # `constant` uploads the numbers to the device once.
         factors = constant(detections["scales"], self.temperatures)[best.labels]  # (M, 2)
         gaussians = Gaussians(
-            means=detections["pts"][..., :2],
+            means=detections["pts"][..., :2],  # without heights
             scales=detections["scales"],
             rotations=detections["rotations"],
         )
-        stretched = stretch_along_line(gaussians, factors[:, None])
+        stretched = stretch_along_line(gaussians, factors[:, None])  # equal for all points
         return {**detections, "scales": stretched.scales, "rotations": stretched.rotations}
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
@@ -150,6 +155,9 @@ class GSMapHead(MapHead):
 
         Args:
             pairs: Matched pairs of the last layer.
+
+        Returns:
+            Scalars by name; empty if the references are no Gaussians, or no loss renders masks.
         """
         space = self.reference.space  # decodes references to Gaussians
         renders_masks = any(isinstance(loss, MaskLoss) for loss in self.losses.values())
@@ -159,7 +167,7 @@ class GSMapHead(MapHead):
             space.decode(pairs.pred_references),
             rendered=pairs.pred_masks,
             masks=pairs.gt_masks,
-            labels=pairs.host_labels,
+            labels=pairs.host_labels,  # classes of the ground truths, on the CPU
             class_names=self.classes,
-            floor_m=space.floor_m,
+            floor_m=space.floor_m,  # smallest sigma
         )

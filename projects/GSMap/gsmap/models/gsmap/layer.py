@@ -13,6 +13,8 @@ from gsmap.models.gsmap.guidance import GaussianGuidance
 class GaussianDecoderLayer(MapDecoderLayer):
     """Decoder layer conditioned on the Gaussians of its queries.
 
+    It is a `MapDecoderLayer` whose part ``guidance`` is a `GaussianGuidance` with these settings.
+
     Args:
         guide_sampling: Whether to transform sampling offsets by the orientation and size of each
             Gaussian.
@@ -46,13 +48,18 @@ def add_guidance(decoder: PartConfig) -> PartConfig:
     """Copy the config of a decoder, and condition its layers on Gaussians by default.
 
     Args:
-        decoder: Config of a decoder, whose settings take precedence.
+        decoder: Config of a decoder, whose settings take precedence. A layer with the guidance None
+            is not conditioned.
+
+    Returns:
+        The copy, in which only ``layer`` is changed.
     """
     layer = decoder.get("layer", {})
-    kind = class_of(with_defaults(decoder, type=MapDecoder))
+    decoder_class = class_of(with_defaults(decoder, type=MapDecoder))
     has_other_layers = False
-    if kind is not None and issubclass(kind, MapDecoder):  # None for a name that is not registered
-        has_other_layers = kind.layer_class is not MapDecoderLayer
+    # The class is None for a name that is not registered; building the decoder fails later.
+    if decoder_class is not None and issubclass(decoder_class, MapDecoder):
+        has_other_layers = decoder_class.layer_class is not MapDecoderLayer
     # By default the layers are of the guided class. If the decoder has a layer class other than
     # `MapDecoderLayer`, its layers keep this class and get the guidance as a part.
     if not has_other_layers:

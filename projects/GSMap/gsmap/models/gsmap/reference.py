@@ -41,11 +41,12 @@ class GaussianReference(PointReference, AddsWeights):
     """
 
     space: GaussianSpace
+    # Class that converts the predictions of the head to detections with scores.
     coder_class = GaussianCoder
     # Prefixes of weights that a checkpoint may lack: their initial values have no effect.
     neutral_keys: tuple[str, ...] = ("gaussian_init.", "gaussian_branches.")
 
-    outputs = ("pts", "scales", "rotations")
+    outputs = ("pts", "scales", "rotations")  # names of the fields that `decode` returns
 
     def __init__(
         self,
@@ -67,9 +68,9 @@ class GaussianReference(PointReference, AddsWeights):
             points_per_state=points_per_state,
         )
         self.space = GaussianSpace(grid, **space)
-        # Statistics of predictions count the sigmas at this lower bound.
+        # Added to the predictions of each sample: their statistics count the sigmas at this bound.
         self.metainfo = {"min_scale_m": self.space.floor_m}
-        entries = 3 * points_per_state
+        entries = 3 * points_per_state  # two sigmas and theta for each point
         self.gaussian_init = nn.Linear(embed_dims, entries)
         dims = [embed_dims, embed_dims, embed_dims, entries] if mlp else [embed_dims, entries]
         self.gaussian_branches = nn.ModuleList(layers.mlp(*dims) for _ in range(num_layers))
@@ -81,7 +82,10 @@ class GaussianReference(PointReference, AddsWeights):
         self.reset_gaussian_parts()
 
     def reset_gaussian_parts(self) -> None:
-        """Set weights so that all queries start with equal Gaussians and layers keep them."""
+        """Set weights so that all queries start with equal Gaussians and layers keep them.
+
+        Only the last linear layer of each network is set to 0, so its output is 0.
+        """
         constant_init(self.gaussian_init, 0.0)
         for branch in self.gaussian_branches:
             *_, last = branch.children()
@@ -89,6 +93,7 @@ class GaussianReference(PointReference, AddsWeights):
 
     def start(self, query_pos: Tensor) -> Tensor:
         """Initial references of n points per query. (..., Q, C) -> (..., Q * n, D)"""
+        # `by_point` splits the 3 n entries of a query into n points.
         shapes = self.by_point(self.gaussian_init(query_pos))  # sigma, theta (..., Q * n, 3)
         return torch.cat([super().start(query_pos), shapes], dim=-1)
 
@@ -118,7 +123,7 @@ class GaussianReference(PointReference, AddsWeights):
         Returns:
             References of the current frame. (B, ..., D)
         """
-        transformed = super().transform_references(references, motion)
+        transformed = super().transform_references(references, motion)  # changes the points only
         # Angle of the motion in the plane. It is added to the angle of every Gaussian.
         rotation = torch.atan2(motion[:, 1, 0], motion[:, 0, 0]).to(transformed)
         while rotation.dim() < transformed.dim():
@@ -127,13 +132,15 @@ class GaussianReference(PointReference, AddsWeights):
         return torch.cat([transformed[..., :-1], theta], dim=-1)
 
     def errors(self, references: Tensor) -> Gaussians:
-        """Gaussians that describe the errors of points. They are equal to the rendered Gaussians.
+        """Gaussians that describe the errors of points, for parts that use uncertainties.
+
+        They are equal to the rendered Gaussians. A subclass may predict separate ones.
 
         Args:
             references: References. (..., P, D)
 
         Returns:
-            Centres and sigmas in metres, angles in radians. (..., P)
+            Centres (..., P, 2) and sigmas (..., P, 2) in metres, and angles in radians (..., P).
         """
         return self.space.decode(references)
 
@@ -158,7 +165,7 @@ class GaussianReference(PointReference, AddsWeights):
 
         Args:
             references: References. (..., P, D)
-            grid: The raster.
+            grid: The raster: its extent in metres, and its H rows and W columns.
 
         Returns:
             Masks in [0, 1]. (..., H, W)

@@ -14,7 +14,8 @@ class LineMaps(NamedTuple):
 
     semantic: Tensor  # logits of the background and the classes (B, 1 + classes, H, W)
     embedding: Tensor  # instance embeddings, similar within an element (B, E, H, W)
-    direction: Tensor  # logits of no direction and of K directions (B, 1 + K, H, W)
+    # Logits of K ranges of the direction of the line at a pixel; the first logit is for no line.
+    direction: Tensor  # (B, 1 + K, H, W)
 
 
 class FineMaps(nn.Sequential):
@@ -52,7 +53,7 @@ class LineMapDecoder(nn.Module):
         embed_dims: Channels C of the BEV features.
         num_classes: Number of classes.
         embedding_dims: Channels E of the instance embedding.
-        num_directions: Number K of directions.
+        num_directions: Number K of directions, which divide the full circle.
         shared_direction_block: Whether the directions share the first block of the embeddings, as
             in the released code; the paper has a separate block.
         base_channels: Channels of the first stage, doubled in each further stage.
@@ -72,10 +73,13 @@ class LineMapDecoder(nn.Module):
         self.stem, self.stages = resnet_stages(BasicBlock, embed_dims, widths=widths)
         self.joined = nn.ModuleList()
         for _ in range(2 if shared_direction_block else 3):
+            # Joins the features of the first stage with the resized features of the last one.
             self.joined.append(JoinedMaps(widths[0] + widths[2], widths[2]))
         if shared_direction_block:
             # The released code runs the shared block twice per step, so its running statistics
-            # are updated twice. One update with this momentum has an equal effect.
+            # are updated twice. An update keeps the share (1 - momentum) of the old statistics, and
+            # two updates keep the square of this share. One update with the momentum below has an
+            # equal effect.
             for module in self.joined[1].modules():
                 if isinstance(module, nn.BatchNorm2d):
                     module.momentum = 1 - (1 - cast(float, module.momentum)) ** 2
@@ -84,7 +88,7 @@ class LineMapDecoder(nn.Module):
             self.maps.append(FineMaps(widths[2], channels))
 
     def init_weights(self) -> None:
-        """Initialise the stages.
+        """Initialise the stages. The other layers keep torch's initial weights.
 
         Convolutions follow Kaiming's method. The last normalisation of each block has weight 0, so
         that the block initially returns its shortcut alone.

@@ -38,12 +38,13 @@ class PriorBEVFusion(BaseModule):
         embed_dims: Channels C of the BEV features.
         num_channels: Channels M of the map in each cell.
         threshold: Smallest value of a channel from which a cell counts as known.
-        layer: Settings of the BEV layer, a `BEVQueryEncoder`. They replace the defaults in
-            ``_LAYER``. None leaves the layer out.
+        layer: Settings of the BEV layer, a `BEVQueryEncoder`, which computes BEV features from the
+            images. They replace the defaults in ``_LAYER``. None leaves the layer out.
         z_range: Lowest and highest z of the pillars of the layer, in metres.
         residual: Whether the result is added to the features through a 1 x 1 convolution, whose
             weights start at 0. A model that was trained without a map then starts with unchanged
             features. If False, the result replaces the features, as published.
+        init_cfg: Initialisation by mmengine, in addition to ``init_weights``; None for none.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class PriorBEVFusion(BaseModule):
         self.layer: Any = None
         if layer is not None:
             sizes = {"grid": grid, "bev_pixel_m": grid.pixel_size_m, "embed_dims": embed_dims}
+            # Settings in `layer` take precedence over the keyword arguments.
             self.layer = build_part(layer, **_LAYER, **sizes, z_range=z_range)
         self.conv = nn.Sequential(
             nn.Conv2d(embed_dims + num_channels, embed_dims, kernel_size=3, padding=1, bias=False),
@@ -72,7 +74,7 @@ class PriorBEVFusion(BaseModule):
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        """Names of the arrays of calibration that the layer reads."""
+        """Names of the calibration arrays that the layer reads; none without a layer."""
         return () if self.layer is None else self.layer.calibration
 
     def init_weights(self) -> None:
@@ -99,18 +101,18 @@ class PriorBEVFusion(BaseModule):
             feats: BEV features. (B, C, H, W)
             cells: Map in each cell, [0, 1]. (B, M, H, W)
             img_feats: Image features, for the layer. (B, V, C, h, w)
-            calibration: A tensor for each name in ``calibration``. (B, ...)
+            calibration: A tensor for each name in the property ``calibration``. (B, ...)
             img_shape: Rows and columns of the padded images.
 
         Returns:
             Fused features. (B, C, H, W)
         """
-        known_feats = feats
+        enhanced_feats = feats
         if self.layer is not None:
-            extra = self.layer.encode(img_feats, calibration, img_shape=img_shape)["bev_feats"]
-            is_known = cells.amax(1, keepdim=True) >= self.threshold
-            known_feats = feats + torch.where(is_known, extra, 0.0)
-        fused = self.conv(torch.cat([known_feats, cells.to(feats.dtype)], dim=1))
+            encoded = self.layer.encode(img_feats, calibration, img_shape=img_shape)
+            is_known = cells.amax(1, keepdim=True) >= self.threshold  # (B, 1, H, W)
+            enhanced_feats = feats + torch.where(is_known, encoded["bev_feats"], 0.0)
+        fused = self.conv(torch.cat([enhanced_feats, cells.to(feats.dtype)], dim=1))
         if self.output_conv is None:
             return fused
         return feats + self.output_conv(fused)

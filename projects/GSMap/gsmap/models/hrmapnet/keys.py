@@ -1,18 +1,21 @@
 """State keys of the released HRMapNet, which is based on MapTRv2, and their names here.
 
-The first two arguments of `rules_of` are the prefixes of keys in the release and here. The text
-lists the rest of each key, as ``released=here`` or as one name that both have.
+The first two arguments of `rules_of` are the prefixes of keys in the release and here. Each word of
+the text continues both prefixes, as ``released=here`` or as one name that both have. ``{i}`` stands
+for a number, which both keys have.
 """
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of
 from gsmap.models.maptr.keys import HEAD, TRANSFORMER
 from gsmap.models.maptrv2.keys import LIFTED_MARKER, LIFTED_UNUSED, MAPTRV2
 
-_BEV_LAYER = "prior.bev.layer."
+_BEV_LAYER = "prior.bev.layer."  # prefix here of the BEV layer that fuses the map
+# Prefix of a transformer layer of this BEV layer in the release.
 _MAP_LAYER = TRANSFORMER + "map_encoder.layers.{i}."
 # Prefixes of the label encoder, released and here.
 _LABEL_ENCODER = (HEAD + "label_encoder.", "prior.queries.label_encoder.")
-# Modules that the released MapTRv2 has but never calls. HRMapNet calls them in its BEV layer.
+# Modules that the released MapTRv2 has but never calls. HRMapNet calls them in its BEV layer, so
+# they are not among its unused keys.
 _USED_AGAIN = ("positional_encoding.", "transformer.level_embeds", "transformer.cams_embeds")
 _UNUSED = {
     key: value
@@ -42,4 +45,4 @@ HRMAPNET = KeyMap(
     markers=(LIFTED_MARKER, _LABEL_ENCODER),
 )
 
-KEY_MAPS = (HRMAPNET,)
+KEY_MAPS = (HRMAPNET,)  # read by `gsmap.checkpoints.key_map`

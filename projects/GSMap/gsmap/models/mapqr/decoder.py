@@ -44,6 +44,7 @@ class Gather(nn.Sequential):
     def __init__(self, embed_dims: int, points: int) -> None:
         inputs = points * embed_dims
         super().__init__()
+        # The layers are children of this module, so their state keys have no further level.
         for layer in mlp(inputs, inputs // 2, embed_dims, embed_dims):
             self.append(layer)
         self.points = points
@@ -71,6 +72,7 @@ class ScatterGatherAttention(BEVDeformableAttention):
     def __init__(self, points_per_instance: int = 20, embed_dims: int = 256, **kwargs: Any) -> None:
         super().__init__(embed_dims=embed_dims, **kwargs)
         self.points_per_instance = points_per_instance
+        # Replaces the projection of the base class, which is applied to the sampled features.
         self.output_proj = Gather(embed_dims, points_per_instance)
 
     def forward(
@@ -85,16 +87,17 @@ class ScatterGatherAttention(BEVDeformableAttention):
 
         Args:
             query: Instance queries. (B, N, C)
-            reference: References of the points, as in `place_samples`. (B, N * P, D)
+            reference: References of the points, which begin with (x, y) in [0, 1] over the map.
+                (B, N * P, D)
             feats: BEV features. (B, C, H, W)
-            frames: Matrices that transform the sampling offsets of the points, as in
-                `place_samples`, or None. (B, N * P, 2, 2)
-            position: Positional encoding of the points. (B, N * P, C)
+            frames: Matrices that multiply the sampling offsets of the points from the left, or None
+                for unchanged offsets. (B, N * P, 2, 2)
+            position: Positional encoding of the points (B, N * P, C), or 0 for none.
 
         Returns:
             A vector per instance. (B, N, C)
         """
-        point_query = query.repeat_interleave(self.points_per_instance, 1)
+        point_query = query.repeat_interleave(self.points_per_instance, 1)  # (B, N * P, C)
         return super().forward(
             point_query + position, reference=reference, feats=feats, frames=frames
         )
@@ -152,27 +155,31 @@ class MapQRDecoderLayer(MapDecoderLayer):
         Args:
             query: Instance queries. (B, N, C)
             inputs: References of the points (B, N * P, D), BEV features (B, C, H, W), and
-                optionally the self-attention mask (N, N), as in `MapDecoderLayer`.
+                the self-attention mask (N, N) or None, as in `MapDecoderLayer`. The mask may be
+                left out if ``mask_groups`` is False.
 
         Returns:
             The updated queries. (B, N, C)
         """
-        reference, bev_feats, *masks = inputs
-        mask = masks[0] if self.mask_groups else None
+        reference, bev_feats, *attn_masks = inputs
+        # `MapDecoder` always gives a mask or None.
+        attn_mask = attn_masks[0] if self.mask_groups else None
         no_position = torch.zeros_like(query)
-        attended = self.self_attn(query, no_position, mask)
+        attended = self.self_attn(query, no_position, attn_mask)  # with the residual
         query = self.norms[0](attended)
         code = sine_code(reference[..., :2], query.shape[-1])
         position = self.position_proj(code)
         frames = None
-        if self.guidance is not None:  # the layer is conditioned on the Gaussians of the points
+        # With guidance, the layer is conditioned on the references: they change the positional
+        # encoding and transform the sampling offsets.
+        if self.guidance is not None:
             position = self.guidance.position(position, reference)
             frames = self.guidance.frames(reference, bev_feats)
         bev_context = self.cross_attn(
             query, reference, feats=bev_feats, frames=frames, position=position
         )
         query = self.norms[1](query + bev_context)
-        return self.norms[2](self.ffn(query))
+        return self.norms[2](self.ffn(query))  # the FFN adds its residual itself
 
 
 @MODELS.register_module()

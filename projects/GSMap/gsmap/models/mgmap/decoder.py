@@ -51,7 +51,11 @@ class RefinedDecoded(Decoded):
     segmentation: Tensor
 
     def of_queries(self, queries: slice) -> Decoded:
-        """Select the output of some instance queries, with the whole segmentation."""
+        """Select the output of some instance queries, with the whole segmentation.
+
+        The method of the base class would cut all fields along the queries, but the segmentation
+        has no dimension of queries. So it is called for the other fields only.
+        """
         all_queries = Decoded(
             self.point_states, self.references, instance_states=self.instance_states
         )
@@ -71,10 +75,11 @@ class MGMapDecoder(MapDecoder):
         layer: Settings of the layer, `MapDecoderLayer` with `MultiLevelAttention`.
         embed_dims: Channels C of the queries and of the BEV features.
         num_masks: Number of masks, one for each instance query of all query groups.
-        patches: Whether the refinement uses a patch around each point. The released model uses
-            patches of zeros, so that the correction of a point does not depend on its position.
-        refinements: Number of refinement stages, which use the prediction branches of the last
-            layers.
+        patches: Whether the refinement uses a patch of the BEV features around each point. If
+            False, all patches are zeros, as in the released model, so that the correction of a
+            point does not depend on its position.
+        refinements: Number of refinement stages. They use the prediction branches (the heads that
+            predict classes and refine references) of the last layers again.
         refine_ffn_dims: Hidden channels of the feed-forward networks of the refinement.
         kwargs: Further arguments of `MapDecoder`.
 
@@ -93,6 +98,7 @@ class MGMapDecoder(MapDecoder):
         **kwargs: Any,
     ) -> None:
         layer = layer or {}
+        # The layers attend to all levels of the neck. Settings of the caller take precedence.
         cross_attn = {"type": MultiLevelAttention, "num_levels": EnhancedNeck.num_levels}
         cross_attn |= layer.get("cross_attn", {})
         layer = {**layer, "cross_attn": cross_attn}
@@ -110,6 +116,7 @@ class MGMapDecoder(MapDecoder):
         self.patches = patches
         self.neck = EnhancedNeck(embed_dims)
         self.mask_net = mask_network(embed_dims, num_masks, activation=nn.ReLU())
+        # Projection of the mean features under the masks, which activate the queries.
         self.activation = nn.Linear(embed_dims, embed_dims)
         self.segmentation = mask_network(embed_dims, 2, activation=nn.LeakyReLU(0.01))
         self.mask_feature = MaskFeature(embed_dims)
@@ -142,15 +149,17 @@ class MGMapDecoder(MapDecoder):
             query_pos: Learned positions of the queries. (B, N * P, C)
             reference: Initial references. (B, N * P, D)
             bev_feats: BEV features. (B, C, H, W)
-            refine: Function from the index of a branch, point states (B, N * P, C) and references
-                (B, N * P, D) to refined references (B, N * P, D).
+            refine: Function of the index of a branch, point states (B, N * P, C) and references
+                (B, N * P, D). It returns the refined references (B, N * P, D).
             attn_mask: True where an instance does not attend to another one, or None. (N, N)
-            between: Function from the index of a layer and the queries after it to the queries of
-                the next layer, or None.
+            between: Function of the index of a layer and the queries after it, which returns the
+                queries of the next layer. None leaves the queries unchanged.
 
         Returns:
-            Outputs of the layers (`MaskedDecoded`) and of the stages (`RefinedDecoded`).
+            Outputs of the layers (`MaskedDecoded`), followed by the outputs of the stages
+            (`RefinedDecoded`).
         """
+        # Fusion of the levels (B, C, H, W), and the four levels, to which the layers attend.
         fused_feats, levels = self.neck(bev_feats)
         num_instances = query.shape[1] // self.num_points
         # The network predicts masks for the instances of all query groups. In inference, there is
@@ -197,16 +206,18 @@ class MGMapDecoder(MapDecoder):
         Args:
             last: Output of the last layer.
             fused_feats: BEV features of all levels of the neck. (B, C, H, W)
-            refine: Function from the index of a branch, point states and references to refined
-                references.
+            refine: Function of the index of a branch, point states and references, which returns
+                the refined references.
             attn_mask: True where an instance does not attend to another one, or None. (N, N)
 
         Returns:
             Outputs of the stages.
         """
-        segmentation = self.segmentation(fused_feats)
+        segmentation = self.segmentation(fused_feats)  # (B, 2, H, W)
+        # Features for the patches: the BEV features, fused with the segmentation and an encoding of
+        # the position. (B, C, H, W)
         feats = self.mask_feature(fused_feats, segmentation) if self.patches else None
-        mask = mask_of_points(attn_mask, self.num_points)
+        mask = mask_of_points(attn_mask, self.num_points)  # (N * P, N * P), or None
         states = last.point_states.flatten(1, 2)  # (B, N * P, C)
         references = last.references.flatten(1, 2)  # (B, N * P, D)
         # One patch of zeros for all points, unless patches are cropped below.
@@ -216,11 +227,15 @@ class MGMapDecoder(MapDecoder):
         for branch, stage in zip(branches, self.refinements, strict=True):
             references = references.detach()
             if feats is not None:
+                # The first two numbers of a reference are the point (x, y), in [0, 1] over the map.
+                # Each point gets a patch. (B, N * P, C, 5, 5)
                 patches = crop_patches(feats, references[..., :2])
             # Glimpses are the features of the patches after attention to the states. (B, N * P, C)
+            # The corrected states serve only for the predictions of this stage. The next stage
+            # receives the states before the correction, followed by the glimpses.
             corrected_states, glimpses = stage(states, patches, mask=mask)
             states = torch.cat([states, glimpses], dim=-1)
             references = refine(branch, corrected_states, references)
-            output = self.read(corrected_states, references)
+            output = self.read(corrected_states, references)  # grouped by instance
             outputs.append(RefinedDecoded(**vars(output), segmentation=segmentation))
         return outputs

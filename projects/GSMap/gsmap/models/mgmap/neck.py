@@ -12,6 +12,9 @@ from gsmap.models.base.layers import resize_map, resnet_stages
 class Gates(nn.Module):
     """Channel attention followed by spatial attention, each from means and maxima (CBAM).
 
+    The channel weights are computed from the mean and the maximum over the cells, and the spatial
+    weights from the mean and the maximum over the channels.
+
     Args:
         channels: Channels C of the map.
     """
@@ -28,10 +31,10 @@ class Gates(nn.Module):
 
     def forward(self, feats: Tensor) -> Tensor:
         """Weight the channels and the cells of a map. (B, C, H, W) -> (B, C, H, W)"""
-        mean = self.channel(feats.mean(dim=(2, 3), keepdim=True))
-        largest = self.channel(feats.amax(dim=(2, 3), keepdim=True))
-        feats = feats * (mean + largest).sigmoid()
-        cell_mean = feats.mean(dim=1, keepdim=True)
+        mean_logits = self.channel(feats.mean(dim=(2, 3), keepdim=True))  # (B, C, 1, 1)
+        max_logits = self.channel(feats.amax(dim=(2, 3), keepdim=True))
+        feats = feats * (mean_logits + max_logits).sigmoid()
+        cell_mean = feats.mean(dim=1, keepdim=True)  # (B, 1, H, W)
         cell_largest = feats.amax(dim=1, keepdim=True)
         cell_logits = self.space(torch.cat([cell_mean, cell_largest], dim=1))
         return feats * cell_logits.sigmoid()
@@ -61,10 +64,14 @@ class GatedBlock(BasicBlock):
 class EnhancedNeck(nn.Module):
     """BEV neck of three stages of gated blocks and a fusion of their outputs (MGMap).
 
-    The stages have C / 4, C / 2 and C channels.
+    The stages have C / 4, C / 2 and C channels. A stem before them halves the resolution, and so do
+    the second and the third stage.
 
     Args:
         embed_dims: Channels C of the BEV features.
+
+    Attributes:
+        num_levels: Number of levels that `forward` returns.
     """
 
     num_levels = 4
@@ -79,7 +86,7 @@ class EnhancedNeck(nn.Module):
             nn.LeakyReLU(0.01),
         )
         self.levels = nn.ModuleList()
-        for width in (*widths, embed_dims):
+        for width in (*widths, embed_dims):  # channels of the stages and of the fusion
             conv = nn.Conv2d(width, embed_dims, kernel_size=1)
             norm = nn.GroupNorm(min(32, embed_dims), embed_dims)
             self.levels.append(nn.Sequential(conv, norm))
@@ -101,7 +108,7 @@ class EnhancedNeck(nn.Module):
         for stage in self.stages:
             feats = stage(feats)
             maps.append(feats)
-        size = bev_feats.shape[2:]
+        size = bev_feats.shape[2:]  # (H, W)
         resized_maps = [resize_map(feats, size) for feats in maps]
         fused_feats = self.fusion(torch.cat(resized_maps, dim=1))
         maps.append(resize_map(fused_feats, stem.shape[2:]))

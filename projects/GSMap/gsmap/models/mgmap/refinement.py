@@ -1,4 +1,7 @@
-"""MGMap's refinement, which corrects the states of points by features cropped around them."""
+"""MGMap's refinement, which corrects the states of points by features cropped around them.
+
+The state of a point is its feature vector after the decoder.
+"""
 
 import torch
 from mmdet.models.backbones.resnet import BasicBlock
@@ -8,7 +11,7 @@ from torch import Tensor, nn
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.structures.tensors import constant
 
-BINS = 5  # bins of a patch along each axis
+BINS = 5  # bins (output cells) of a patch along each axis
 SAMPLES = 2  # sampling points of a bin along each axis
 _PATCH_SHARE = 0.1  # side of a patch divided by the side of the map
 
@@ -21,7 +24,8 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
 
     Args:
         feats: Features. (B, C, H, W)
-        centres: Centres (x, y) of the patches in [0, 1] over the map. (B, Q, 2)
+        centres: Centres (x, y) of the patches in [0, 1] over the map; larger values count as 1.
+            (B, Q, 2)
 
     Returns:
         Patches. (B, Q, C, 5, 5)
@@ -31,7 +35,8 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     # Compute the sampling points in [0, 1] over a patch.
     steps = (torch.arange(BINS * SAMPLES, device=feats.device) + 0.5) / (BINS * SAMPLES)
     grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)  # (10, 10, 2)
-    # Convert the sampling points to cells of the map.
+    # Convert the sampling points to cells of the map. As in RoIAlign, a patch has at least the size
+    # of a cell.
     corners = (centres.clamp(max=1.0) - _PATCH_SHARE / 2) * size
     patch_size = (_PATCH_SHARE * size).clamp(min=1.0)
     samples = corners[:, :, None, None] + grid * patch_size  # (B, Q, 10, 10, 2)
@@ -40,6 +45,7 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     samples = samples.unflatten(2, (BINS, SAMPLES))  # (B, Q, 5, 2, 5, 2, 2)
     samples = samples.transpose(3, 4).flatten(4, 5)  # (B, Q, 5, 5, 4, 2)
     samples = samples.flatten(1, 3)[:, :, None]  # (B, Q * 25, 1, 4, 2)
+    # Centres of cells are at 0 to size - 1, so -1 and `size` are one cell outside of the map.
     inside = ((samples >= -1) & (samples <= size)).all(dim=-1)
     samples_on_map = samples.clamp(min=0.0).minimum(size - 1)
     # `deformable_sample` has values at the centres of cells, half a cell from integer positions.
@@ -49,7 +55,7 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     # A bin is the mean over its sampling points. Points outside the map count as 0.
     patches = deformable_sample(
         values, (height, width), locations=locations, weights=inside / SAMPLES**2
-    )
+    )  # (B, Q * 25, C)
     return patches.unflatten(1, (-1, BINS, BINS)).movedim(-1, 2)
 
 
@@ -58,7 +64,8 @@ class MaskFeature(nn.Module):
 
     Args:
         embed_dims: Channels C of the BEV features.
-        hidden: Channels of the segmentation embedding.
+        hidden: Channels of the segmentation embedding, which is computed from the probabilities
+            of elements and of background.
     """
 
     def __init__(self, embed_dims: int, hidden: int = 32) -> None:
@@ -85,12 +92,15 @@ class MaskFeature(nn.Module):
         x = (x - 0.5).abs()
         position = torch.stack(torch.meshgrid(x, y, indexing="xy"))  # (2, H, W)
         position = position.expand(len(feats), -1, -1, -1)
-        mask = self.block(self.expand(segmentation.softmax(dim=1)))
-        return self.reduce(torch.cat([feats, mask, position], dim=1))
+        embedding = self.block(self.expand(segmentation.softmax(dim=1)))  # (B, hidden, H, W)
+        return self.reduce(torch.cat([feats, embedding, position], dim=1))
 
 
 class _HalfAttention(nn.TransformerDecoderLayer):
     """Decoder layer that halves the outputs of both attentions before they are added.
+
+    The two attentions are self-attention (``_sa_block``) and attention to the memory
+    (``_mha_block``). Each output is added to the input of its attention.
 
     It overrides private methods of PyTorch, which pass their arguments by position.
     """
@@ -123,7 +133,8 @@ class PatchRefinement(BaseModule):
 
     Args:
         embed_dims: Channels C of the patches and of the corrected states.
-        state_dims: Channels S of the input states.
+        state_dims: Channels S of the input states. It may differ from C, because the caller appends
+            the glimpses of earlier refinements to the states.
         num_heads: Number of attention heads.
         ffn_dims: Hidden channels of the feed-forward network.
         dropout: Probability of setting a value to zero in training, in [0, 1].
@@ -134,6 +145,7 @@ class PatchRefinement(BaseModule):
     ) -> None:
         super().__init__()
         self.patch_net = nn.Sequential(
+            # The kernel covers the whole patch, so each patch becomes one vector.
             nn.Conv2d(embed_dims, embed_dims, kernel_size=BINS, groups=4),
             nn.Flatten(),
             nn.LayerNorm(embed_dims),
@@ -153,7 +165,10 @@ class PatchRefinement(BaseModule):
         )
 
     def init_weights(self) -> None:
-        """Initialise all matrices outside of the layer by Xavier's normal distribution."""
+        """Initialise the weights outside of the attention layer by Xavier's normal distribution.
+
+        Their biases are set to 0.
+        """
         for module in (*self.patch_net, *self.memory, *self.fuser):
             if isinstance(module, (nn.Conv2d, nn.Linear)):
                 nn.init.xavier_normal_(module.weight)
@@ -180,7 +195,8 @@ class PatchRefinement(BaseModule):
         glimpses = glimpses.expand(states.shape[0], states.shape[1], -1)
         memory = self.memory(states)
         glimpses = self.norm(self.layer(glimpses, memory, tgt_mask=mask, memory_mask=mask))
-        # The gradient reaches the input states only through the memory of the attention.
+        # `fuser` gets detached states, so the gradient reaches the input states only through the
+        # memory of the attention.
         corrected_states = self.fuser(torch.cat([states.detach(), glimpses], dim=-1))
         return corrected_states, glimpses
 

@@ -16,7 +16,11 @@ from gsmap.utils.errors import InputError
 
 
 class Granularities(NamedTuple):
-    """Instance and point queries of all map elements, passed from layer to layer."""
+    """Instance and point queries of all map elements, passed from layer to layer.
+
+    The positional codes are computed from the sampling locations. The loss of sampling locations
+    reads the mean locations.
+    """
 
     instances: Tensor  # instance queries (B, N, C)
     points: Tensor | None = None  # point queries, None before the first layer (B, N, P, C)
@@ -25,7 +29,10 @@ class Granularities(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Locations and weights of K BEV samples per point, level and head."""
+    """Locations and weights of K BEV samples per point, level and head.
+
+    Both kinds of weights are softmax functions of equal logits, over different axes.
+    """
 
     locations: Tensor  # (x, y) in [0, 1] over the map (B, N, P, levels, heads, K, 2)
     point_weights: Tensor  # weights for points, with sum 1 over K (B, N, P, levels, heads, K)
@@ -72,7 +79,7 @@ class PerPointSampling(SamplingAttention):
             frames: Rotations of the offsets of each point, or None. (B, N * P, 2, 2)
 
         Returns:
-            Updated queries.
+            Updated queries, with the mean locations of their samples.
 
         Raises:
             ValueError: If the number of levels or of points differs from the settings.
@@ -86,12 +93,15 @@ class PerPointSampling(SamplingAttention):
     def update(
         self, state: Granularities, feats: Sequence[Tensor], samples: Samples
     ) -> Granularities:
-        """Update the queries from the sampled features.
+        """Update the queries from the sampled features, residuals included.
 
         Args:
             state: Queries of the previous layer.
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
             samples: Locations and weights of the samples.
+
+        Returns:
+            Updated queries. `forward` adds their mean locations.
         """
         raise NotImplementedError
 
@@ -120,12 +130,13 @@ class PerPointSampling(SamplingAttention):
                 f"expected {num_levels} levels of BEV features and {num_points} points per "
                 f"instance, got {len(feats)} and {reference.shape[2]}."
             )
+        # The base class returns all offsets of a head in one axis, in cells of their level.
         offsets = self.offsets_in_cells(query).unflatten(-2, self.sample_shape)
         # (B, N, heads, levels, P, K, 2) -> (levels, B, N, P, heads, K, 2)
         offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6)
         offsets = offsets.flatten(2, 3)  # (levels, B, N * P, heads, K, 2)
         point_references = reference.flatten(1, 2)  # (B, N * P, D)
-        level_locations = []
+        level_locations = []  # (B, N * P, heads, K, 2) each
         for level_offsets, level in zip(offsets, feats, strict=True):
             height, width = level.shape[-2:]
             locations = place_samples(
@@ -174,7 +185,8 @@ class MultiPointAttention(PerPointSampling):
     """Attention that updates only the instance queries, from samples around all of their points.
 
     A linear layer computes the point queries from the instance query. This attention is the
-    baseline in the tables of MGMapNet. It corresponds to `LinePointAttention`.
+    baseline in the tables of MGMapNet. It corresponds to `LinePointAttention`, the attention of
+    StreamMapNet.
 
     Args:
         embed_dims: Channels C.
@@ -236,6 +248,7 @@ class MultiGranularityAttention(PerPointSampling):
     ) -> None:
         super().__init__(embed_dims=embed_dims, **kwargs)
         _, num_points, num_samples = self.sample_shape
+        # Each call creates a new module, so `p2p` and `p2i` share no weights.
         interaction = partial(
             Interaction,
             embed_dims=embed_dims,
@@ -248,7 +261,7 @@ class MultiGranularityAttention(PerPointSampling):
         self.p2i = interaction() if p2i else None
         self.point_code: nn.Sequential | None = None
         self.instance_code: nn.Sequential | None = None
-        attends = p2p or p2i
+        attends = p2p or p2i  # without attention, codes would have no effect
         if position_codes and attends:
             self.point_code = mlp(2 * num_samples, embed_dims, embed_dims)
         if position_codes and p2i:
@@ -305,12 +318,13 @@ class MultiGranularityAttention(PerPointSampling):
         # The shape becomes (B, N, P, levels, heads, C / heads).
         by_head = by_head.unflatten(1, (-1, self.points_per_instance))
         shares = samples.weights.sum(dim=-1)  # (B, N, P, levels, heads)
+        # In the indices, p is the point, l the level, h the head and c the channel of a head.
         instances = torch.einsum("bnplh,bnplhc->bnhc", shares, by_head)
         return instances.flatten(2), by_head.mean(dim=3).flatten(3)
 
     def codes(self, samples: Samples) -> tuple[Tensor | float, Tensor | float]:
         """Compute the position codes of points (B, N, P, C) and instances (B, N, C), or 0."""
-        locations = samples.locations.mean(dim=(3, 4))  # (B, N, P, K, 2)
+        locations = samples.locations.mean(dim=(3, 4))  # over levels and heads (B, N, P, K, 2)
         point_code: Tensor | float = 0.0
         instance_code: Tensor | float = 0.0
         # Differs from the poster, which encodes locations and weights as two inputs of the MLP: the

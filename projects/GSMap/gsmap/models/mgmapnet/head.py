@@ -17,6 +17,8 @@ from gsmap.models.mgmapnet.losses import InstanceMaskLoss, SamplingLocationLoss
 from gsmap.structures.grid import BEVGrid
 
 LINE_WIDTH_PX = 3
+# Groups of instance queries. In the second group, which is used in training only, each ground truth
+# is matched with 6 queries.
 QUERY_GROUPS: tuple[PartConfig, ...] = (
     {"num": 100},
     {"name": "one2many", "num": 600, "repeats": 6},
@@ -54,6 +56,8 @@ class MGMapHead(MapHead):
     ) -> None:
         mask_settings = masks or {}
         element_masks = ElementMasks(grid, **mask_settings)
+        # The default width is in pixels, and the size of a pixel is known only after `ElementMasks`
+        # is created. Therefore the width is set here and not given as a setting.
         if "line_width_m" not in mask_settings:
             pixel_m = 2 * element_masks.half_pixel_m
             element_masks.line_width_m = LINE_WIDTH_PX * pixel_m
@@ -74,6 +78,8 @@ class MGMapHead(MapHead):
 def convert_decoder(decoder: PartConfig) -> PartConfig:
     """Convert the settings of a decoder to settings of `MGMapNetDecoder`.
 
+    Settings of `MGMapNetDecoder` or a subclass are returned as they are.
+
     The layers and attentions in the configs of MapTR and MapTRv2 need one query per point. Their
     settings are left out, so that the defaults of MGMapNet replace them, and a log message names
     them. Other attentions are kept.
@@ -81,8 +87,8 @@ def convert_decoder(decoder: PartConfig) -> PartConfig:
     decoder_class = class_of(decoder)
     if decoder_class is not None and issubclass(decoder_class, MGMapNetDecoder):
         return decoder
-    layer = dict(decoder.get("layer", {}))
-    replaced_parts = {}
+    layer = dict(decoder.get("layer", {}))  # a copy, from which settings are removed
+    replaced_parts = {}  # removed settings by name; None if they were absent
     layer_class = class_of(layer)
     if layer_class is None or not issubclass(layer_class, MGMapNetDecoderLayer):
         replaced_parts["type"] = layer.pop("type", None)
@@ -93,6 +99,7 @@ def convert_decoder(decoder: PartConfig) -> PartConfig:
     # Settings without a type belong to `BEVDeformableAttention`, the default of `MapDecoderLayer`.
     if class_of(cross_attn) in (None, BEVDeformableAttention):
         replaced_parts["cross_attn"] = layer.pop("cross_attn", None)
+    # Only settings that the config gives are logged.
     configured_parts = {name: part for name, part in replaced_parts.items() if part}
     if configured_parts:
         text = f"MGMapHead replaces {configured_parts} of its decoder's layers."

@@ -1,8 +1,13 @@
 """Mapping between the state keys of the released PivotNet and of this project.
 
 `rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
-Each word of the text continues both prefixes: ``released=here``, or one name for both. `mlps` takes
-the prefixes of a multilayer perceptron, in the release and here.
+Each word of the text continues both prefixes: ``released=here``, or one name for both. ``{i}``
+stands for a number, which both keys have; ``{LINEAR}`` is replaced by its value, the names of the
+layers of a feed-forward network. `mlps` takes the prefixes of a multilayer perceptron, in the
+release and here.
+
+``BEV`` and ``LINE_DECODER`` are prefixes of released keys. ``LINE_DECODER_RULES`` and
+``HEAD_RULES`` are the rules that PivotNet and BeMapNet have in common.
 """
 
 import torch
@@ -51,10 +56,12 @@ PIVOTNET = KeyMap(
         *mlps("output_head.pts_cls_heads.{i}.", "map_head.kind_branches.{i}."),
         *HEAD_RULES,
     ),
+    # Released keys without a counterpart here, with the values that conversion to the release
+    # writes.
     unused={
-        **CLASS_WEIGHTS,
-        # Settings of the release: order of the concatenated cameras, and class weights of a loss
-        # that is not used here.
+        **CLASS_WEIGHTS,  # class weights of the classification loss
+        # Settings that the release stores as tensors: the order of the concatenated cameras, and
+        # the class weights of a loss that is not used here.
         BEV + "image_order": torch.arange(6),
         "post_processor.criterion.collinear_pt_weight": torch.tensor((0.2, 1.0)),
     },
@@ -63,4 +70,4 @@ PIVOTNET = KeyMap(
     upstream_prefix=LINE_DECODER,  # only released checkpoints have keys with this prefix
 )
 
-KEY_MAPS = (PIVOTNET,)
+KEY_MAPS = (PIVOTNET,)  # read by `gsmap.checkpoints.key_map`

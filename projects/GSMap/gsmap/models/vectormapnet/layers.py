@@ -76,7 +76,14 @@ class GatedLayer(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def keys_values(self, states: Tensor) -> Cache:
-        """Compute the keys and values of the self-attention. (n, T, C)"""
+        """Compute the keys and values of T tokens for the self-attention of this layer.
+
+        The cache of `forward` consists of such keys and values: of all tokens in training, and of
+        the new and the earlier tokens when tokens are generated one by one.
+
+        Args:
+            states: States of the tokens before this layer. (n, T, C)
+        """
         return self.self_attn.keys_values(self.norms[0](states))
 
     def forward(
@@ -86,7 +93,7 @@ class GatedLayer(nn.Module):
 
         Args:
             states: States of the tokens of n lines. (n, T, C)
-            cache: Keys and values of the S tokens that self-attention covers.
+            cache: Keys and values (`keys_values`) of the S tokens that self-attention covers.
                 (n, heads, S, C / heads) each
             memory: Keys and values of the map's cells, shared by all lines.
                 (1, heads, cells, C / heads) each
@@ -109,6 +116,7 @@ def append_cache(cache: Cache | None, new: Cache) -> Cache:
     """Append keys and values of new tokens to a cache, which is None if it is empty."""
     if cache is None:
         return new
+    # Dimension 2 is the dimension of the tokens.
     keys = torch.cat([cache[0], new[0]], dim=2)
     values = torch.cat([cache[1], new[1]], dim=2)
     return keys, values
@@ -123,7 +131,7 @@ def keep_most_likely(logits: Tensor, share: float) -> Tensor:
             mass; the most likely token is never masked.
 
     Returns:
-        Logits with -1e9 for masked tokens. (..., tokens)
+        Logits with -1e9 for masked tokens, so that their probability is 0. (..., tokens)
     """
     sorted_logits, index = logits.sort(dim=-1, descending=True)
     probs = sorted_logits.softmax(dim=-1)

@@ -5,6 +5,9 @@
 The backward pass of torch sorts all indices and goes through the table twice. The backward pass
 here adds the gradient of each sum to the rows of the sum in order, in one thread, so repeated runs
 are bitwise equal.
+
+`fused_operator` finds `sum_rows` and `sum_rows_backward` by their names, and makes an operator of
+torch of them. They are called with float32 tensors.
 """
 
 import torch
@@ -14,6 +17,7 @@ from numba import njit
 from gsmap.ops._numba import FASTMATH
 
 
+# FASTMATH allows the compiler to reorder sums, so that they are computed in vector lanes.
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
 def scatter_rows(grads, table, weights, rows, grad_table, grad_weights):
     """Compute the gradients of weighted sums of table rows.
@@ -31,14 +35,14 @@ def scatter_rows(grads, table, weights, rows, grad_table, grad_weights):
         for s in range(rows.shape[1]):
             row = rows[bag, s]
             weight = weights[bag, s]
-            source = table[row]
-            target = grad_table[row]
-            total = grad[0] * 0  # zero in the type of the gradient
+            table_row = table[row]
+            grad_table_row = grad_table[row]
+            grad_weight = grad[0] * 0  # zero in the type of the gradient
             for c in range(len(grad)):
-                total += grad[c] * source[c]
+                grad_weight += grad[c] * table_row[c]
             for c in range(len(grad)):
-                target[c] += weight * grad[c]
-            grad_weights[bag, s] = total
+                grad_table_row[c] += weight * grad[c]
+            grad_weights[bag, s] = grad_weight
 
 
 def sum_rows(table, weights, rows):
@@ -67,8 +71,8 @@ def sum_rows_backward(grads, table, weights, rows):
     Returns:
         Gradients of the table (R, C) and of the weights (n, S).
     """
-    grad_table = torch.zeros(table.shape)
-    grad_weights = torch.empty(weights.shape)
+    grad_table = torch.zeros(table.shape)  # gradients are added to it
+    grad_weights = torch.empty(weights.shape)  # every entry is written
     scatter_rows(
         grads.contiguous().numpy(),
         table.contiguous().numpy(),

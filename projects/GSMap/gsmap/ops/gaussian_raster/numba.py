@@ -47,14 +47,15 @@ BIAS = np.int32(127)  # of the exponent of a float32
 MANTISSA_BITS = np.int32(23)  # of a float32
 MAX_DENSITY = np.float32(1 - 1e-6)
 HALF_LOG2E = 0.5 / math.log(2)
-LANES = 16  # pixels of a row that are computed at a time
+# Pixels of a row that are computed at a time. The compiler can vectorise loops of a fixed length.
+LANES = 16
 
 
 @njit(inline="always")
 def exp2_float32(x):
     """Compute 2^x for x <= 0, at least 2^-126."""
     x = max(x, LOWEST)
-    whole = np.int32(x - HALF)  # rounded to the nearest, as x <= 0
+    whole = np.int32(x - HALF)  # the conversion cuts towards 0: x <= 0 is rounded to the nearest
     part = x - np.float32(whole)
     power = ((((C5 * part + C4) * part + C3) * part + C2) * part + C1) * part + C0
     # A float32 with the exponent field whole + BIAS and the mantissa 0 has the value 2^whole.
@@ -119,9 +120,15 @@ def _row_geometry(gaussian, frame, size, spans, parabolas):
 def _accumulate(gaussian, frame, steps, mask, spans, parabolas, through):
     """Add one Gaussian to a mask R or, if ``through``, multiply it into a transmittance T.
 
-    The mask (H, W + LANES) has a margin, so that the last block of a row may exceed W. ``steps``
-    contains 0, 1, 2, .. times the width of a pixel in metres, and ``spans`` and ``parabolas`` are
-    buffers for `_row_geometry`.
+    Args:
+        gaussian: Mean x, y, scales u, v and rotation. (5,)
+        frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
+        steps: 0, 1, 2, .. times the width of a pixel in metres. (W + LANES,)
+        mask: R or T, changed in place. It has a margin, so that the last block of a row may exceed
+            W. (H, W + LANES)
+        spans: Buffer for `_row_geometry`. (2, H)
+        parabolas: Buffer for `_row_geometry`. (4, H)
+        through: False for R <- R + G (1 - R), True for T <- T (1 - G).
     """
     size = (mask.shape[0], mask.shape[1] - LANES)  # without the margin
     top, bottom, curvature, _, _ = _row_geometry(
@@ -136,12 +143,21 @@ def _accumulate(gaussian, frame, steps, mask, spans, parabolas, through):
             for k in range(LANES):
                 t = start + distances[k]
                 density = min(exp2_float32(-(curvature * t * t + base)), MAX_DENSITY)
+                # R + G (1 - R) = R (1 - G) + G. Only the last term is missing in the update of T.
                 pixels[k] = pixels[k] * (ONE - density) + (ZERO if through else density)
 
 
 @njit(inline="always")
 def _row_sums(grad, steps, start, curvature, base):
-    """Sums of w, w t and w t^2 over pixels of a row, where ``grad`` is the product dL/dR * T."""
+    """Sums of w, w t and w t^2 over pixels of a row.
+
+    Args:
+        grad: Product dL/dR * T at the pixels. (n,)
+        steps: Distance of each pixel from the first one in metres. (>= n,)
+        start: t at the first pixel.
+        curvature: Curvature of the parabola, as `_row_geometry` returns it.
+        base: Constant of the parabola, times ``HALF_LOG2E``.
+    """
     sum_0 = ZERO
     sum_1 = ZERO
     sum_2 = ZERO
@@ -160,9 +176,10 @@ def _row_sums(grad, steps, start, curvature, base):
 # load it from the cache can differ in the last bit.
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", forceinline=True)
 def _gaussian_gradient(gaussian, frame, steps, grad, spans, parabolas, out):
-    """Compute the gradient of one Gaussian (5,) from ``grad``, the product dL/dR * T.
+    """Compute the gradient of one Gaussian and write it to ``out`` (5,).
 
-    The other arguments are described in `_accumulate`.
+    ``grad`` is the product dL/dR * T (H, W + LANES), which is 0 in the margin. The other arguments
+    are described in `_accumulate`.
     """
     size = (grad.shape[0], grad.shape[1] - LANES)  # without the margin
     top, bottom, curvature, cos, sin = _row_geometry(
@@ -200,13 +217,18 @@ def _gaussian_gradient(gaussian, frame, steps, grad, spans, parabolas, out):
 
 @njit(nogil=True, cache=True)
 def _can_be_rendered(gaussians):
-    """Whether all parameters of an instance are finite and its scales not zero."""
+    """Whether all parameters of an instance (P, 5) are finite and its scales not zero."""
     return np.isfinite(gaussians).all() and gaussians[:, 2:4].all()
 
 
 @njit(nogil=True, cache=True)
 def _buffers(shape, step):
-    """Buffers of a thread, as in `_accumulate`: a mask with a margin, steps, spans, parabolas."""
+    """Buffers of a thread, as in `_accumulate`: a mask with a margin, steps, spans, parabolas.
+
+    Args:
+        shape: Height H and width W of the raster in pixels.
+        step: Width of a pixel in metres.
+    """
     width = shape[1] + LANES
     mask = np.empty((shape[0], width), np.float32)
     steps = (np.arange(width) * step).astype(np.float32)
@@ -243,6 +265,7 @@ def render_forward(gaussians, frame, masks, first, last):
                 parabolas=parabolas,
                 through=False,
             )
+        # Copy without the margin.
         for row in range(masks.shape[1]):
             for col in range(masks.shape[2]):
                 masks[n, row, col] = mask[row, col]
@@ -307,6 +330,7 @@ def render_gaussians(gaussians, frame, height, width):
         Masks, float32. (N, H, W)
     """
     masks = torch.empty(len(gaussians), height, width, dtype=torch.float32)
+    # Each thread calls the kernel for a range of instances, whose ends are its last two arguments.
     run_in_threads(render_forward, height * width, gaussians.double(), tuple(frame), masks)
     return masks
 
@@ -322,7 +346,7 @@ def render_gaussians_backward(grads, gaussians, frame, height, width):
         width: Columns W of the raster.
 
     Returns:
-        Tuple with one entry, the gradient of the Gaussians, float32. (N, P, 5)
+        Tuple with one entry, the gradient with respect to ``gaussians``, float32. (N, P, 5)
     """
     gradients = torch.empty(gaussians.shape, dtype=torch.float64)
     pixels = height * width

@@ -16,7 +16,8 @@ from gsmap.utils.errors import InputError
 # shifted by this distance along x and along y, as in the code of Zhang et al.
 LANE_GAP_PX = 0.01
 DISTANCES = ("squared", "plain")
-# The lambda functions return the shape of the masks.
+# Each operator calls the fused kernel of a backend, "cpu" or "triton". The second text has the
+# arguments as a torch schema. The lambda functions return the shape of the masks.
 _draw = fused_operator(
     "polyline_raster.draw_polylines",
     "Tensor polylines, Tensor filled, int height, int width, float[] frame, float half_width, "
@@ -27,7 +28,7 @@ _soft_rasters = fused_operator(
     "polyline_raster.soft_rasters",
     "Tensor rings, Tensor is_polygon, int height, int width, float[] softness, bool plain",
     lambda rings, is_polygon, height, width, *_: (len(rings), height, width),
-    differentiable=1,  # rings
+    differentiable=1,  # the first tensor, `rings`, has gradients
 )
 
 
@@ -65,12 +66,14 @@ def draw_polylines(
         )
     if not width_m > 0:
         raise InputError(f"width_m must be > 0, got {width_m}.")
-    flags = _flags(filled, "filled", polylines=polylines)
+    flags = _flags(filled, "filled", polylines=polylines)  # all False for None
     polylines = at_least_float32(polylines.detach())
     dx, dy = grid.pixel_size_m
     half_width_m = width_m / 2
-    pixel_m = (dx * dy) ** 0.5
+    pixel_m = (dx * dy) ** 0.5  # side of a square pixel of equal area
+    # Autocast is off, since half precision is too coarse for distances.
     with torch.autocast(polylines.device.type, enabled=False):
+        # "auto" becomes the name of a backend: "reference", "cpu" or "triton".
         backend = choose_backend(backend, polylines, kernel="draw_polylines")
         if backend != "reference":
             return _draw(
@@ -78,6 +81,7 @@ def draw_polylines(
                 flags,
                 height=grid.height,
                 width=grid.width,
+                # Lower corner of the raster and size of a pixel, in metres.
                 frame=[grid.x_range[0], grid.y_range[0], dx, dy],
                 half_width=half_width_m,
                 pixel=pixel_m,
@@ -132,15 +136,16 @@ def soft_rasters(
         raise InputError(f"softness must be > 0, got {line_softness} and {polygon_softness}.")
     if distance not in DISTANCES:
         raise InputError(f"distance must be one of {DISTANCES}, got {distance!r}.")
-    flags = _flags(is_polygon, "is_polygon", polylines=vertices)
+    flags = _flags(is_polygon, "is_polygon", polylines=vertices)  # all False for None
     plain = distance == "plain"
     with torch.autocast(vertices.device.type, enabled=False):
         vertices = at_least_float32(vertices)
+        # The second half of each ring is the way back along a line.
         # Differs from Zhang et al.'s Eqs. (2-3) by default: D is squared, as in their rasterizer.
         back = vertices.flip(1) + LANE_GAP_PX
         # Polygons are padded with their last vertex, so that all rings have 2 V vertices.
-        stay = vertices[:, -1:].expand_as(vertices)
-        second_half = torch.where(flags[:, None, None], stay, back)
+        padding = vertices[:, -1:].expand_as(vertices)
+        second_half = torch.where(flags[:, None, None], padding, back)
         rings = torch.cat([vertices, second_half], dim=1)  # (n, 2 V, 2)
         softness = [line_softness, polygon_softness]
         backend = choose_backend(backend, rings, kernel="soft_rasters")

@@ -1,13 +1,17 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Fused CPU kernels (numba): soft rasters and ground-truth masks.
+"""Fused CPU kernels (numba): soft rasters of predictions, and drawn masks of ground truth.
 
-A thread computes one element at a time. For each edge and row, only the pixels within a reach of
-the edge are computed: beyond it a soft raster differs from 0 or 1 by less than 1e-8, and the mask
-of a line is empty. Two buffers per thread, of the size of a mask, store the smallest squared
-distance of each pixel and the index of its nearest edge. There is no tensor per edge. The backward
-pass computes both again and adds the gradient of each pixel to the two ends of its nearest edge, in
-float64 and in a fixed order, so repeated runs are bitwise equal.
+Both are called masks below: one raster (H, W) for each element. A thread computes one element at a
+time. For each edge and row, only the pixels within a reach of the edge are computed. Beyond the
+reach, a pixel of a soft raster differs from 0 or 1 by less than 1e-8, and a drawn pixel is 0 or 1.
+
+Three buffers per thread, each of the size of a mask, store the smallest squared distance of each
+pixel, the index of its nearest edge, and whether it is inside of a polygon. There is no tensor per
+edge. The backward pass computes the buffers again and adds the gradient of each pixel to the two
+ends of its nearest edge, in float64 and in a fixed order, so repeated runs are bitwise equal.
+
+In the options of the compiler, ``nogil`` lets the threads run in parallel.
 """
 
 import math
@@ -19,20 +23,24 @@ from numba import njit
 from gsmap.ops._numba import FASTMATH, pixel_range, run_in_threads
 from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
-FAR = np.float32(np.inf)
+FAR = np.float32(np.inf)  # squared distance of a pixel without an edge within reach
 # Largest D / softness that counts, with D the distance (or its square) of a pixel from an edge.
 # Farther pixels are 0 or 1.
 REACH = -math.log(1e-8)
 # Smallest x and y, and size of a pixel along x and y, of a raster in pixels. The centre of pixel
-# (row, col) is at (x, y) = (col, row), where the rasterizer released by Zhang et al. samples it.
+# (row, col) is at (x, y) = (col, row), as in the rasterizer that Zhang et al. (MapVR) released.
 INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)
 
 
+# `FASTMATH` allows the compiler to reorder sums. With numpy's error model, a division by 0 raises
+# no error. Both allow the inner loop to be computed in vector lanes.
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
 def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_indices):
     """Update the squared distances and nearest edges of pixels (H, W) with one more edge.
 
-    ``columns`` contains 0, 1, .. W - 1 as float32.
+    The edge from ``start`` to ``end`` has the number ``index``. ``eps`` is added to its squared
+    length: `LENGTH_EPS` in soft rasters, as in Zhang et al.'s released code, and 0 in drawn masks.
+    ``columns`` contains 0, 1, .. W - 1 as float32, so that the inner loop converts no integers.
     """
     x_min, y_min, step_x, step_y = frame
     height, width = distances.shape
@@ -41,7 +49,8 @@ def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_i
     edge_x = float(end[0]) - x0
     edge_y = float(end[1]) - y0
     length = math.sqrt(edge_x * edge_x + edge_y * edge_y)
-    # The lower limit avoids a division by 0 for an edge of length 0 if `eps` is 0.
+    # The lower limit avoids a division by 0 for an edge of length 0 if `eps` is 0. The edge is
+    # prepared in float64, and the inner loop computes in float32.
     length2 = max(edge_x * edge_x + edge_y * edge_y + eps, 1e-38)
     along_x = np.float32(edge_x / length2)
     along_y = np.float32(edge_y / length2)
@@ -52,6 +61,7 @@ def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_i
     high_y = max(y0, y0 + edge_y) + reach
     low_x = min(x0, x0 + edge_x) - reach
     high_x = max(x0, x0 + edge_x) + reach
+    # First row, and one past the last row, whose centres lie in this interval.
     top, bottom = pixel_range(low_y, high_y, origin=y_min, step=step_y, size=height)
     for row in range(top, bottom):
         offset_y = y_min + (row + 0.5) * step_y - y0
@@ -72,6 +82,7 @@ def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_i
         fy = np.float32(offset_y)
         for k in range(len(nearest)):
             fx = first_x + columns[k] * pixel_width
+            # Position of the nearest point of the edge, 0 at its start and 1 at its end.
             t = min(max(fx * along_x + fy * along_y, np.float32(0)), np.float32(1))
             dx = fx - t * ex
             dy = fy - t * ey
@@ -92,14 +103,14 @@ def _fill_inside(ring, frame, inside):
         y0 = float(ring[i, 1])
         x1 = float(ring[j, 0])
         y1 = float(ring[j, 1])
-        if y0 == y1:
+        if y0 == y1:  # a horizontal edge crosses no row
             continue
         top, bottom = pixel_range(
             min(y0, y1), max(y0, y1), origin=y_min, step=step_y, size=len(inside)
         )
         for row in range(top, bottom):
             y = y_min + (row + 0.5) * step_y
-            if (y0 > y) == (y1 > y):
+            if (y0 > y) == (y1 > y):  # both ends are on one side of the row
                 continue
             crossing = (x1 - x0) * (y - y0) / (y1 - y0) + x0
             position = (crossing - x_min) / step_x - 0.5  # fractional column of the crossing
@@ -110,7 +121,7 @@ def _fill_inside(ring, frame, inside):
 
 @njit(nogil=True, cache=True)
 def _buffers(shape):
-    """Buffers of a thread: column indices, squared distances, nearest edges, inside."""
+    """Buffers of a thread: column indices (W,), squared distances, nearest edges, inside (H, W)."""
     columns = np.arange(shape[1]).astype(np.float32)
     distances = np.empty(shape, np.float32)
     edge_indices = np.empty(shape, np.int32)
@@ -123,8 +134,9 @@ def _nearest_edges(ring, closed, filled, frame, reach, eps, buffers):
     """Compute the distances, nearest edges and inside of `_buffers` for one polyline or ring.
 
     Beyond the reach, squared distances are infinite and indices of edges -1. The inside is computed
-    only if ``filled``. If a vertex is not finite, the buffers stay as they are, and the function
-    returns False.
+    only if ``filled``. If ``closed``, there is also an edge from the last vertex to the first one.
+
+    Returns True, or False if a vertex is not finite. The buffers then stay as they are.
     """
     if not np.isfinite(ring).all():
         return False
@@ -198,18 +210,23 @@ def soft_forward(rings, polygons, reach, softness, min_distance, masks, first, l
         for row in range(masks.shape[1]):
             for col in range(masks.shape[2]):
                 fade = 0.0
-                if edge_indices[row, col] >= 0:
+                if edge_indices[row, col] >= 0:  # an edge is within reach
                     distance = _clamped_distance(distances[row, col], min_distance)
                     fade = math.exp(-distance / softness[kind])
                 value = fade
-                if kind:  # sigmoid(D / s) = 1 / (1 + fade), sigmoid(-D / s) = fade / (1 + fade)
+                # For a polygon, sigmoid(D / s) = 1 / (1 + fade) inside, and
+                # sigmoid(-D / s) = fade / (1 + fade) outside.
+                if kind:
                     value = (1.0 if inside[row, col] else fade) / (1 + fade)
                 masks[n, row, col] = value
 
 
 @njit(nogil=True, cache=True)
 def _scatter(ring, edge_index, x, y, weight, out):
-    """Add ``weight`` times the gradient of the squared distance to both ends of an edge."""
+    """Add ``weight`` times the gradient of the squared distance of a pixel to both ends of an edge.
+
+    The pixel is at (``x``, ``y``). ``out`` has the gradients of the vertices of ``ring``. (V, 2)
+    """
     following = edge_index + 1 if edge_index + 1 < len(ring) else 0
     x0 = float(ring[edge_index, 0])
     y0 = float(ring[edge_index, 1])
@@ -222,12 +239,14 @@ def _scatter(ring, edge_index, x, y, weight, out):
     t = min(max(along, 0.0), 1.0)
     dx = fx - t * ex
     dy = fy - t * ey
-    # The squared distance is D = d . d with d = f - t e, the offset of the pixel from the point at
-    # t of the edge. Because of LENGTH_EPS, this point is not exactly the nearest one: between the
-    # ends, dD/dt = -2 d . e = -2 t LENGTH_EPS is not 0. With dt/de = (f - 2 t e) / length2 and
-    # dt/df = e / length2, the derivatives are dD/de = -2 t d - slip (f - 2 t e) and
-    # dD/df = 2 d - slip e. As e = end - start and f = pixel - start, the gradient is dD/de for the
-    # end and -dD/df - dD/de for the start.
+    # With e = end - start, f = pixel - start and t = f . e / length2, limited to [0, 1], the offset
+    # of the pixel from the point at t of the edge is d = f - t e. The squared distance is
+    # Q = d . d. Because length2 contains LENGTH_EPS, this point is not exactly the nearest one:
+    # between the ends, dQ/dt = -2 d . e = -2 t LENGTH_EPS is not 0. The derivatives of t are
+    # dt/de = (f - 2 t e) / length2 and dt/df = e / length2. With slip = 2 t LENGTH_EPS / length2
+    # (0 beyond the ends, where t is constant), the derivatives of Q are
+    # dQ/de = -2 t d - slip (f - 2 t e) and dQ/df = 2 d - slip e.
+    # The gradient is dQ/de for the end, and -dQ/df - dQ/de for the start.
     slip = 2 * t * LENGTH_EPS / length2 if 0.0 <= along <= 1.0 else 0.0
     end_x = -2 * t * dx - slip * (fx - 2 * t * ex)
     end_y = -2 * t * dy - slip * (fy - 2 * t * ey)
@@ -246,7 +265,8 @@ def soft_backward(rings, polygons, reach, softness, min_distance, grads, out, fi
         polygons: Whether a ring is a polygon, bool. (N,)
         reach: Distance in pixels beyond which a mask is 0 or 1, of lines and of polygons. (2,)
         softness: Softness s of lines and of polygons, in the unit of D. (2,)
-        min_distance: 0 for squared distances, otherwise the smallest distance, see `soft_forward`.
+        min_distance: 0 if D is the squared distance to the nearest edge. Otherwise D is the
+            distance, and ``min_distance`` its smallest value, at which it has no gradient.
         grads: Gradient of the masks, float32. (N, H, W)
         out: Output for the gradient of the rings, float64; NaN for a ring with a vertex that is not
             finite. (N, V, 2)
@@ -273,12 +293,13 @@ def soft_backward(rings, polygons, reach, softness, min_distance, grads, out, fi
             continue
         for row in range(grads.shape[1]):
             for col in range(grads.shape[2]):
+                # Pixels without an edge within reach have no gradient.
                 if edge_indices[row, col] < 0 or grads[n, row, col] == 0:
                     continue
                 distance = _clamped_distance(distances[row, col], min_distance)
                 fade = math.exp(-distance / softness[kind])
                 slope = -fade  # derivative of the mask by D / s
-                if kind:
+                if kind:  # derivative of the sigmoid, negative outside
                     slope = (1.0 if inside[row, col] else -1.0) * fade / (1 + fade) ** 2
                 weight = grads[n, row, col] * slope / softness[kind]  # gradient of D
                 if min_distance > 0:  # gradient of the squared distance, whose root is D
@@ -295,7 +316,7 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
         filled: Whether a polyline is filled as a polygon, bool. (K,)
         frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
         half_width: Half the width of a line in metres.
-        pixel: Side in metres of a square with the area of a pixel.
+        pixel: Side in metres of a square with the area of a pixel, whose sides may differ.
         masks: Output for the masks, float32; NaN for a polyline with a vertex that is not finite.
             (K, H, W)
         first: First polyline.
@@ -304,7 +325,7 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
     buffers = _buffers(masks.shape[1:])
     _, distances, _, inside = buffers
     for n in range(first, last):
-        kind = filled[n]  # whether it is a filled polygon
+        kind = filled[n]  # True for a filled polygon, False for a line
         reach = pixel if kind else half_width + pixel
         is_finite = _nearest_edges(
             polylines[n],
@@ -321,7 +342,10 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
         for row in range(masks.shape[1]):
             for col in range(masks.shape[2]):
                 distance = math.sqrt(distances[row, col])
-                if kind:  # the edge cuts the pixel at the signed distance from its centre
+                # `share` is the share of the pixel's area that the shape covers. It is computed
+                # across the edge or line, on which the pixel is an interval of length `pixel`.
+                if kind:
+                    # The edge cuts the interval at the signed distance from the pixel's centre.
                     signed = distance if inside[row, col] else -distance
                     share = min(0.5 + signed / pixel, 1.0)
                 else:
@@ -334,7 +358,10 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
 
 
 def _reach(softness, plain):
-    """Distance in pixels beyond which masks are 0 or 1, of lines and of polygons."""
+    """Distance in pixels beyond which masks are 0 or 1, of lines and of polygons.
+
+    D is the distance if ``plain``, and otherwise its square, so the root of its limit is taken.
+    """
     line, polygon = softness
     if plain:
         return REACH * line, REACH * polygon
@@ -342,7 +369,7 @@ def _reach(softness, plain):
 
 
 def soft_rasters(rings, is_polygon, height, width, softness, plain):
-    """Render closed rings softly, see `soft_rasters_reference`.
+    """Render closed rings softly, as `soft_rasters_reference` does in plain torch.
 
     Args:
         rings: Vertices of closed rings in pixels, float32. (n, V, 2)
@@ -359,6 +386,9 @@ def soft_rasters(rings, is_polygon, height, width, softness, plain):
     reach = _reach(softness, plain)
     min_distance = DISTANCE_EPS if plain else 0.0
     pixels = height * width
+    # `run_in_threads` cuts the rings into one slice per thread. It calls the kernel with these
+    # arguments, in which tensors are arrays on their memory, and the bounds `first` and `last` of a
+    # slice.
     run_in_threads(
         soft_forward, pixels, rings, is_polygon, reach, tuple(softness), min_distance, masks
     )
@@ -378,7 +408,8 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
         plain: Whether D is the distance to the nearest edge instead of its square.
 
     Returns:
-        Tuple with one entry, the gradient of the rings, float32. (n, V, 2)
+        Tuple with one entry, the gradient of the rings, float32. (n, V, 2) The caller
+        (`fused_operator`) takes a sequence with one gradient per differentiable argument.
     """
     out = torch.empty(rings.shape, dtype=torch.float64)
     reach = _reach(softness, plain)
@@ -391,7 +422,7 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
 
 
 def draw_polylines(polylines, filled, height, width, frame, half_width, pixel):
-    """Draw polylines and filled polygons, see `draw_reference`.
+    """Draw polylines and filled polygons, as `draw_reference` does in plain torch.
 
     Args:
         polylines: Vertices in metres, float32. (K, P, 2)

@@ -2,15 +2,16 @@
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernel that sums the pixelwise minimum of each pair of masks.
 
-A program computes one pair. It loops over blocks of pixels with one partial sum per lane, and adds
-the partial sums at the end. There are no atomics, so repeated runs are equal to the bit.
+A program is one instance of the kernel. It computes one pair of a prediction and a ground truth. It
+loops over blocks of pixels with one partial sum per lane, and adds the partial sums at the end.
+There are no atomics, so repeated runs are equal to the bit.
 """
 
 import torch
 import triton
 import triton.language as tl
 
-BLOCK = 1024
+BLOCK = 1024  # pixels read at a time
 
 
 @triton.jit
@@ -24,15 +25,17 @@ def minima_kernel(preds, targets, minima, pixels, BLOCK: tl.constexpr):
         pixels: Number of pixels of a mask.
         BLOCK: Number of pixels read at a time.
     """
+    # With int64, the positions n * pixels and k * pixels cannot overflow.
     k = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1).to(tl.int64)
     sums = tl.zeros((BLOCK,), dtype=tl.float32)
     for start in range(0, pixels, BLOCK):
         index = start + tl.arange(0, BLOCK)
+        # Beyond the last pixel nothing is read (``mask`` is an argument of Triton), and 0 is added.
         pred = tl.load(preds + n * pixels + index, mask=index < pixels, other=0.0)
         target = tl.load(targets + k * pixels + index, mask=index < pixels, other=0.0)
         sums += tl.minimum(pred, target)
-    tl.store(minima + n * tl.num_programs(0) + k, tl.sum(sums))
+    tl.store(minima + n * tl.num_programs(0) + k, tl.sum(sums))  # num_programs(0) is K
 
 
 def pairwise_minima(preds, targets):
@@ -41,8 +44,8 @@ def pairwise_minima(preds, targets):
     Masks are flat float32 tensors.
     """
     minima = preds.new_empty(len(preds), len(targets))
-    if minima.numel():
-        with torch.cuda.device_of(preds):
+    if minima.numel():  # a kernel cannot be launched without programs
+        with torch.cuda.device_of(preds):  # Triton launches on the current device
             minima_kernel[len(targets), len(preds)](
                 preds.contiguous(),
                 targets.contiguous(),
