@@ -48,6 +48,8 @@ def _unique_bytes() -> int:
 def _read_in_worker(file: AnnotationFile, reads: int) -> tuple[int, int, int, int]:
     """Read random samples and measure the memory of this process, which has read nothing before.
 
+    The points are counted, so that every element that is read is also used.
+
     Args:
         file: Annotation file.
         reads: Number of samples to read.
@@ -58,11 +60,11 @@ def _read_in_worker(file: AnnotationFile, reads: int) -> tuple[int, int, int, in
     """
     before = _unique_bytes()
     order = np.random.default_rng(0).integers(len(file), size=reads)
-    points = 0
+    num_points = 0
     for row in order:
-        for instance in file[int(row)].instances or []:
-            points += len(instance.points)
-    return before, _unique_bytes(), psutil.Process().memory_info().rss, points
+        for instance in file[int(row)].instances or []:  # None without ground truth
+            num_points += len(instance.points)
+    return before, _unique_bytes(), psutil.Process().memory_info().rss, num_points
 
 
 def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
@@ -88,6 +90,7 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
     for row in np.random.default_rng(1).integers(len(file), size=1000):
         file[int(row)]
     read_ms = time.process_time() - start  # seconds of 1000 reads = milliseconds of one read
+    # A fresh process, as a worker of a data loader is: it has read nothing before.
     before, after, rss, _ = in_own_process(_read_in_worker, file, reads)
     return {
         "samples": len(file),
@@ -103,12 +106,13 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
 class PerItemGroundTruth:
     """Ground truth that is computed for each item by a walk over all records of the map.
 
-    It is computed with the devkit, as in data loaders that compute ground truth while loading. The
-    classes are divider (0), crossing (1) and boundary (2). The benchmark compares it with
-    ``NuScenesLocalMap``, which is prepared once for each map.
+    It is computed with the nuScenes devkit, as in data loaders that compute ground truth while
+    loading. The classes are divider (0), crossing (1) and boundary (2). The benchmark compares it
+    with ``NuScenesLocalMap``, which is prepared once for each map.
 
     Args:
-        nusc_map: Map of the devkit.
+        nusc_map: Map of the devkit (``NuScenesMap``). A layer such as ``nusc_map.lane`` is a list
+            of records, and `extract_line` and `extract_polygon` make their shapely geometries.
         x_range: Smallest and largest x in metres.
         y_range: Smallest and largest y in metres.
     """
@@ -124,10 +128,10 @@ class PerItemGroundTruth:
         """Compute the elements around a pose.
 
         Args:
-            global_from_frame: Pose of the frame, in metres. (4, 4)
+            global_from_frame: Transform from the annotation frame to the map, in metres. (4, 4)
 
         Returns:
-            Elements in the frame.
+            Elements in the annotation frame, in metres.
         """
         x, y = global_from_frame[:2, 3]
         yaw = np.arctan2(global_from_frame[1, 0], global_from_frame[0, 0])
@@ -138,12 +142,14 @@ class PerItemGroundTruth:
         patch = affinity.translate(rotated, xoff=x, yoff=y)
 
         def to_frame(geometry: shapely.Geometry) -> shapely.Geometry:
+            """Transform a geometry from the map to the frame."""
             shifted = affinity.translate(geometry, xoff=-x, yoff=-y)
             return affinity.rotate(shifted, -yaw, origin=(0, 0), use_radians=True)
 
         instances = []
         for line in self._dividers(patch, to_frame):
             instances.append(MapInstance(0, line))
+        # Areas of one layer that touch or overlap are joined before their outlines are taken.
         crossings = shapely.union_all(self._areas("ped_crossing", patch, to_frame=to_frame))
         for ring in _rings(crossings):
             instances.append(MapInstance(1, shapely.get_coordinates(ring)))
@@ -153,18 +159,19 @@ class PerItemGroundTruth:
         # Outlines are cut 0.2 m inside the range, so that the edge of the range is not a boundary.
         inner = box.buffer(-0.2, join_style="mitre")
         for ring in _rings(surface):
+            # A ring is also cut at its start. `line_merge` joins the two pieces there.
             for piece in shapely.get_parts(shapely.line_merge(ring.intersection(inner))):
                 instances.append(MapInstance(2, shapely.get_coordinates(piece)))
         return instances
 
     def _dividers(self, patch: shapely.Polygon, to_frame: Callable[..., Any]) -> list[np.ndarray]:
-        """Dividers inside a patch of the map, in the frame. Each (n, 2)"""
+        """Dividers inside a patch of the map, in the frame by ``to_frame``. Each (n, 2)"""
         lines = []
         for layer in ("road_divider", "lane_divider"):
             for record in getattr(self._map, layer):
                 token = record["line_token"]
                 if len(self._map.get("line", token)["node_tokens"]) < 2:
-                    continue
+                    continue  # not a line
                 line = self._map.extract_line(token).intersection(patch)
                 if not line.is_empty:
                     for part in shapely.get_parts(to_frame(line)):
@@ -174,7 +181,7 @@ class PerItemGroundTruth:
     def _areas(
         self, layer: str, patch: shapely.Polygon, to_frame: Callable[..., Any]
     ) -> list[shapely.Geometry]:
-        """Areas of a layer inside a patch of the map, in the frame."""
+        """Valid areas of a layer inside a patch of the map, in the frame by ``to_frame``."""
         areas = []
         for record in getattr(self._map, layer):
             polygon = self._map.extract_polygon(record["polygon_token"])
@@ -186,7 +193,7 @@ class PerItemGroundTruth:
 
 
 def _rings(area: shapely.Geometry) -> list[shapely.Geometry]:
-    """Rings of the polygons of an area."""
+    """Outer and inner rings of the polygons of an area; points and lines in it are left out."""
     parts = shapely.get_parts(area)
     polygons = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
     return list(shapely.get_rings(polygons))
@@ -200,10 +207,12 @@ def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[n
         num_points: Number of points P of each order.
 
     Returns:
-        Both directions of a line, or all rotations of a ring, in metres. Each (S, P, 2)
+        The S equivalent orders of each element: both directions of a line, or at most P - 1
+        rotations of a ring, in metres. Each (S, P, 2)
     """
 
     def resample(points: np.ndarray) -> np.ndarray:
+        """Resample to P points at equal distances. (n, 2) -> (P, 2)"""
         line = shapely.LineString(points)
         distances = np.linspace(0, line.length, num=num_points)
         return np.array([line.interpolate(distance).coords[0] for distance in distances])
@@ -227,7 +236,7 @@ def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[n
 def open_maps(
     root: Path, x_range: tuple[float, float], y_range: tuple[float, float]
 ) -> tuple[dict[str, NuScenesLocalMap], dict[str, PerItemGroundTruth]]:
-    """Open all maps of a data root for both ways to compute ground truth.
+    """Open the maps that a data root has, for both ways to compute ground truth.
 
     Args:
         root: Data root with the map expansion.
@@ -237,6 +246,7 @@ def open_maps(
     Returns:
         ``NuScenesLocalMap`` by name, and ``PerItemGroundTruth`` by name.
     """
+    # The devkit is optional. `locations` are the names of all nuScenes maps.
     from nuscenes.map_expansion.map_api import NuScenesMap, locations
 
     prepared = {}
@@ -262,7 +272,7 @@ def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dic
 
     The first one takes it from a map that is prepared once (`NuScenesLocalMap`). The second one
     walks over all records of the map for each frame (`PerItemGroundTruth`). Passes over all poses
-    alternate between the two.
+    alternate between the two, so that a slow phase of the machine affects both.
 
     Args:
         root: Data root with the map expansion.
@@ -303,7 +313,8 @@ def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, floa
 
     The first pipeline reads it from the annotation file. The second one computes it for each item
     by a walk over the records of the map, and resamples the orders of points with one call per
-    point, as in MapTR's data set. Both apply equal image transforms. Their passes alternate.
+    point, as in MapTR's data set. Both apply equal image transforms. Each has three passes, which
+    alternate, and the fastest one counts.
 
     Args:
         config: Config of a ``VectorizedMapDataset``.
@@ -315,7 +326,7 @@ def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, floa
     """
     from mmdet3d.registry import DATASETS
 
-    dataset = DATASETS.build(deepcopy(config))
+    dataset = DATASETS.build(deepcopy(config))  # a copy, which building may change
     meta = dataset.metainfo
     _, per_item = open_maps(root, meta["x_range"], y_range=meta["y_range"])
     dataset[0]  # opens the files, outside of the measured time
@@ -326,9 +337,10 @@ def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, floa
 
     def run_per_item() -> None:
         for number in range(count):
-            results = dataset.get_data_info(number % len(dataset))
+            results = dataset.get_data_info(number % len(dataset))  # before all transforms
             truth = per_item[results["map_name"]].instances(results["lidar2global"])
             for transform in dataset.pipeline.transforms:
+                # `FormatMapTargets` makes the orders of points from the annotation file.
                 if type(transform).__name__ == "FormatMapTargets":
                     results["orders"] = per_item_orders(truth, transform.num_points)
                 else:

@@ -75,7 +75,7 @@ def generated_frames(
 ) -> list[Record]:
     """Generate random frames that resemble a validation set, with lines and crossings.
 
-    Predictions are the ground truth with noise.
+    Each prediction is an element of the ground truth, resampled and shifted, with a random score.
 
     Args:
         count: Number of frames.
@@ -84,19 +84,16 @@ def generated_frames(
             their number does not depend on it.
 
     Returns:
-        Frames with ``token``, ``gt`` and ``pred``.
+        Frames with ``token``, ``gt`` and ``pred``, as in the file of ``--frames``.
     """
     rng = np.random.default_rng(seed)
-    stretch = np.array(size_m) / (30.0, 60.0)
+    stretch = np.array(size_m) / (30.0, 60.0)  # elements are drawn for a map of 30 x 60 m
     frames = []
     for number in range(count):
         truths = []
         preds = []
-        for label, max_count in (
-            (0, 12),
-            (1, 4),
-            (2, 7),
-        ):  # label, largest number of elements
+        # Each pair is a label and the largest number of its elements in a frame.
+        for label, max_count in ((0, 12), (1, 4), (2, 7)):
             for _ in range(rng.integers(max_count + 1)):
                 line = _random_element(rng, label) * stretch
                 truths.append({"label": label, "pts": np.round(line, 3).tolist()})
@@ -109,17 +106,20 @@ def generated_frames(
 
 
 def _random_element(rng: np.random.Generator, label: int) -> np.ndarray:
-    """Draw a crossing (label 1) or a line inside 30 x 60 m, in metres. (P, 2)"""
-    centre = rng.uniform(low=[-13, -25], high=[13, 25])
+    """Draw a crossing (label 1) or a line on a map of 30 x 60 m, in metres. (P, 2)
+
+    Lines lie inside the map. A crossing may reach a few metres beyond its upper edges.
+    """
+    position = rng.uniform(low=[-13, -25], high=[13, 25])  # a crossing's corner, or a line's x
     if label == 1:
         w, h = rng.uniform(low=1.5, high=7, size=2)
-        return centre + np.array([[0, 0], [w, 0], [w, h], [0, h], [0, 0]])
+        return position + np.array([[0, 0], [w, 0], [w, h], [0, h], [0, 0]])
     # A parabola along y, clipped to the range.
     start = -rng.uniform(low=3, high=28)
     end = rng.uniform(low=3, high=28)
     t = np.linspace(start, end, num=20)
     bend = rng.normal(scale=0.004) * t**2
-    return np.clip(centre[0] + np.stack([bend, t], axis=1), [-15, -30], [15, 30])
+    return np.clip(position[0] + np.stack([bend, t], axis=1), [-15, -30], [15, 30])
 
 
 def _add_noise(line: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -128,6 +128,7 @@ def _add_noise(line: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     positions = np.linspace(0, len(line) - 1, num=20)
     x = np.interp(positions, vertices, line[:, 0])
     y = np.interp(positions, vertices, line[:, 1])
+    # The size of the errors is random, too, so that some predictions are much better than others.
     shift_m = rng.normal(scale=rng.uniform(low=0, high=1.0), size=2)
     return np.stack([x, y], axis=1) + shift_m
 
@@ -161,10 +162,12 @@ def write_repeated_frames(folder: Path, frames: list[Record], count: int) -> tup
         """Yield the token and the elements of each sample; ``part`` is ``"pred"`` or ``"gt"``."""
         for k in range(count):
             frame = frames[k % len(frames)]
+            # The number makes the tokens of repeated frames different.
             yield f"{frame['token']}_{k:05d}", list(map(_vector, frame[part]))
 
     results = folder / f"results_{count}.json"
     truth = folder / f"truth_{count}.json"
+    # `key` is the name of the list of samples in the file.
     write_results(results, vectors("pred"), key="results")
     write_results(truth, vectors("gt"), key="GTs")
     return results, truth
@@ -180,7 +183,7 @@ def _resident_mib(pid: int) -> float:
     total = sum(_resident_mib(int(child)) for child in children)
     for line in status.splitlines():
         if line.startswith("VmRSS"):
-            total += int(line.split()[1]) / 1024
+            total += int(line.split()[1]) / 1024  # the file has KiB
     return total
 
 
@@ -194,7 +197,7 @@ def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, worke
         workers: Number of worker processes of the command.
 
     Returns:
-        Time and memory.
+        Time and memory. The peak is the largest of the values that are read every 20 ms.
 
     Raises:
         WorkError: If the command fails.
@@ -207,13 +210,14 @@ def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, worke
     start = time.perf_counter()
     process = subprocess.Popen([*command, "--workers", str(workers)], stdout=subprocess.DEVNULL)
     peak = 0.0
+    # Unlike `Popen.wait`, `os.wait4` also returns the processor time, with the workers' time.
     pid = 0
     while pid == 0:  # `os.wait4` returns 0 as long as the process runs
         peak = max(peak, _resident_mib(process.pid))
         time.sleep(0.02)
         pid, status, usage = os.wait4(process.pid, os.WNOHANG)
     wall = time.perf_counter() - start
-    process.returncode = os.waitstatus_to_exitcode(status)
+    process.returncode = os.waitstatus_to_exitcode(status)  # `Popen` did not wait and lacks it
     if process.returncode:
         raise WorkError(f"{' '.join(command)} ended with {process.returncode}.")
     return Run(wall_s=wall, cpu_s=usage.ru_utime + usage.ru_stime, peak_mib=peak)
@@ -271,17 +275,19 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
     ):
         evaluator = MapEvaluator(config)
         first_preds, first_truths = samples[0]
-        evaluator.match("warm-up", first_preds, first_truths)
+        evaluator.match("warm-up", first_preds, first_truths)  # the first call compiles kernels
         start = time.process_time()
         reference_mean_ap = evaluate_by_reference()
         reference_ms = (time.process_time() - start) / count * 1e3
         if name == "raster" and not reference.FILLS_AS_RELEASED:
             # The installed OpenCV fills polygons differently from the versions behind the published
-            # figures. The mAP is therefore computed without OpenCV's filling.
+            # figures. The mAP is therefore computed without OpenCV's filling. The time above is
+            # measured with it.
             reference_mean_ap = reference.raster_map(samples, raster, by_opencv=False)
         start = time.process_time()
         matches = []
         for k, (preds, truths) in enumerate(samples):
+            # Repeated frames need different tokens, because repeated tokens count once.
             matches.append(evaluator.match(f"{k:06d}", preds, truths))
         our_mean_ap = evaluator.reports(matches)[0].metrics[f"{name}/mAP"]
         our_ms = (time.process_time() - start) / count * 1e3
@@ -299,7 +305,7 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
 
 
 def _print_progress(text: str) -> None:
-    """Print a measurement to the standard error at once, before the others are done."""
+    """Print a measurement at once, to the standard error: the output is the report alone."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -314,10 +320,10 @@ def run(args: argparse.Namespace) -> None:
         frames = generated_frames(320, size_m=args.size)
     x = args.size[0] / 2
     y = args.size[1] / 2
-    grid = BEVGrid((-x, x), (-y, y))
+    grid = BEVGrid((-x, x), (-y, y))  # only the range is used
     reference = _reference_table(frames, args.reference_samples, grid=grid)
     _print_progress(reference)
-    parts = [
+    sections = [
         f"Matching alone, processor time a frame, {args.reference_samples} samples:\n",
         reference,
         "\nThe whole command, start, reading and printing included:\n",
@@ -347,8 +353,8 @@ def run(args: argparse.Namespace) -> None:
                     f"{cost.peak_mib:.0f}",
                 ]
                 rows.append(row)
-            for path in files:
+            for path in files:  # large files, removed before the next ones are written
                 path.unlink()
     header = ["samples", "metrics", "processes", "wall s", "CPU s", "CPU ms a frame", "peak MiB"]
-    parts.append(markdown_table(header, rows))
-    publish("\n".join(parts), args.out)
+    sections.append(markdown_table(header, rows))
+    publish("\n".join(sections), args.out)  # prints the text and writes it to the file

@@ -31,9 +31,13 @@ def run(args: argparse.Namespace) -> None:
     Args:
         args: Parsed options of ``add_arguments``.
     """
+    # Each tuple has the arguments of one call of `frame_cost`. On a CPU, each call runs in a
+    # separate process.
     costs = measure_each(frame_cost, [(path, args, args.cuda_graphs) for path in args.configs])
     device = torch.device(args.device)
     _, first_cost = costs[0]
+    # `time_s` is processor time on a CPU, which other processes do not disturb, and wall-clock time
+    # on a GPU.
     first_seconds = first_cost.time_s(device)
     rows = []
     for path, cost in costs:
@@ -41,7 +45,7 @@ def run(args: argparse.Namespace) -> None:
         row = [
             Path(path).stem,
             f"{seconds:.3f}",
-            f"{first_seconds / seconds:.3f}",
+            f"{first_seconds / seconds:.3f}",  # ratio of frame rates, so the times are swapped
             f"{cost.wall_s:.3f}",
             f"{1 / cost.wall_s:.2f}",
             f"{cost.peak_bytes / MIB:.0f}",
@@ -54,7 +58,8 @@ def run(args: argparse.Namespace) -> None:
 def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -> Cost:
     """Measure the inference of a config's model, from images to decoded elements.
 
-    A temporal model uses the features of the previous frame.
+    The model has random weights, and its input is one sample of random images. A temporal model
+    uses the features that it stored in the previous call.
 
     Args:
         path: Config file.
@@ -68,16 +73,18 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
     model.eval()
     if cuda_graphs:
         return _replayed_frame_cost(model, inputs, samples=samples, args=args)
-    # Half precision on a GPU converts the weights of the backbone; on a CPU it uses autocast.
-    halved = args.fp16 and args.device != "cpu"
-    if halved:
+    # With --fp16 on a GPU, the weights of the backbone are converted to float16, and float32 matrix
+    # products of the other layers use TF32. On a CPU, the whole model runs under autocast.
+    has_half_weights = args.fp16 and args.device != "cpu"
+    if has_half_weights:
         model.halve_backbone()
 
     @torch.no_grad()
     def predict() -> None:
+        # Temporal models expect a later frame in each call: time and pose are advanced in place.
         advance_samples(samples)
-        autocast = torch.autocast(args.device, enabled=args.fp16 and not halved)
-        with autocast, matrix_products(in_tf32=halved):
+        autocast = torch.autocast(args.device, enabled=args.fp16 and not has_half_weights)
+        with autocast, matrix_products(in_tf32=has_half_weights):
             model.predict(inputs, samples)
 
     return measure(predict, torch.device(args.device), repeats=args.repeats)
@@ -86,12 +93,16 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
 def _replayed_frame_cost(
     model: Any, inputs: dict[str, Tensor], samples: list[Any], args: argparse.Namespace
 ) -> Cost:
-    """Measure frames replayed as CUDA graphs, from pixels on the GPU to samples on the host."""
+    """Measure frames replayed as CUDA graphs, from pixels on the GPU to samples on the host.
+
+    Samples are not advanced, because `StaticFrame` refuses temporal models.
+    """
     if args.fp16:
         model.halve_backbone()
     device = torch.device(args.device)
-    frames = FastFrames(StaticFrame(model), device)
-    # Approximate pixel values of the normalised images.
+    predict_batch = FastFrames(StaticFrame(model), device)
+    # `StaticFrame` starts from pixel values. A typical standard deviation (50) and mean (120) turn
+    # the normalised random images into such values.
     images = (inputs["imgs"][0] * 50 + 120).clamp(0, 255).to(torch.uint8)
     batch = {"inputs": {"img": [images]}, "data_samples": samples[:1]}
-    return measure(partial(frames, batch), device, repeats=args.repeats)
+    return measure(partial(predict_batch, batch), device, repeats=args.repeats)

@@ -32,9 +32,10 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write, write_text
 from gsmap.utils.parallel import ordered_map
 
-METRIC_NAMES = ("chamfer", "raster")
+METRIC_NAMES = ("chamfer", "raster")  # APs with matches by Chamfer distance, and by raster IoU
 WARM_UP = 100  # iterations
-# Options that the figures (values of the metrics) depend on.
+# Options that the figures (values of the metrics) depend on. The seed is not among them, because it
+# is part of the file names.
 _FIGURE_OPTIONS = (
     "config",
     "checkpoint",
@@ -51,10 +52,10 @@ class Task:
     """Training and test of one head.
 
     Attributes:
-        config: Config file of the head.
-        options: Overrides of the config.
+        config: Config file of the model with the head.
+        options: Overrides of the config, by dotted key.
         seed: Seed of new weights and of the order of the batches.
-        results: Result file to write.
+        results: File to write the predictions of the val split to.
     """
 
     config: Path
@@ -87,22 +88,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Store the features, train and test every variant, and print a table.
 
+    Features and figures that are already in the output folder are used again, so an interrupted
+    command continues.
+
     Args:
         args: Parsed options of ``add_arguments``.
 
     Raises:
         ValueError: If the output folder has figures of other settings.
     """
+    # Config file and overrides of each variant, as one text, by the name of the variant.
     variants: dict[str, str] = json.loads(args.variants.read_text())
     settings = {key: str(getattr(args, key)) for key in _FIGURE_OPTIONS}
     for name, variant in variants.items():
         record_settings(args.out / f"{name}.settings.json", {**settings, "variant": variant})
-    options = data_root_options(args.data_root)
-    features = {part: args.out / f"{part}.pt" for part in ("train", "val")}
-    for part, path in features.items():
+    options = data_root_options(args.data_root)  # overrides that set the data root of each split
+    feature_files = {split: args.out / f"{split}.pt" for split in ("train", "val")}
+    for split, path in feature_files.items():
         if not path.exists():
             cfg = read_config(args.config, options)
-            store_features(cfg, args.checkpoint, part=part, path=path)
+            store_features(cfg, args.checkpoint, part=split, path=path)
+    # Both dictionaries have the keys (name of the variant, seed).
     figures: dict[tuple[str, int], dict[str, float]] = {}
     tasks: dict[tuple[str, int], Task] = {}
     for name, variant in variants.items():
@@ -118,9 +124,10 @@ def run(args: argparse.Namespace) -> None:
                 seed=seed,
                 results=args.out / f"{name}-{seed}/results.json",
             )
-    train = partial(train_and_test, args=args, features=features)
-    results = ordered_map(train, tasks.values(), args.workers, timeout_s=None)
-    for (name, seed), task_figures in zip(tasks, results, strict=True):
+    train = partial(train_and_test, args=args, features=feature_files)
+    # Worker processes run the tasks. The figures arrive in the order of the tasks.
+    figures_of_tasks = ordered_map(train, tasks.values(), args.workers, timeout_s=None)
+    for (name, seed), task_figures in zip(tasks, figures_of_tasks, strict=True):
         figures[name, seed] = task_figures
         write_text(args.out / f"{name}-{seed}.json", json.dumps(task_figures, indent=1))
         print(f"{name}, seed {seed}: {', '.join(cells(task_figures))}", flush=True)
@@ -133,7 +140,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def record_settings(path: Path, settings: dict[str, str]) -> None:
-    """Write the settings of a variant's figures to a file.
+    """Write the settings of a variant's figures to a file, unless it has other settings.
 
     Args:
         path: JSON file.
@@ -148,7 +155,14 @@ def record_settings(path: Path, settings: dict[str, str]) -> None:
 
 
 def cells(figures: dict[str, float]) -> list[str]:
-    """Format both APs of every class and their mean, in percent."""
+    """Format both APs of every class, then both means over the classes, in percent.
+
+    Args:
+        figures: Values by metric and class, such as ``chamfer/divider/AP``, and ``chamfer/mAP``.
+
+    Returns:
+        One text for each class and one for the mean, such as ``60.1 / 55.3`` (Chamfer / raster).
+    """
     keys = [f"{name}/AP" for name in CLASSES]
     keys.append("mAP")
     texts = []
@@ -163,7 +177,7 @@ def cells(figures: dict[str, float]) -> list[str]:
 
 @torch.no_grad()
 def store_features(cfg: Config, checkpoint: str, part: str, path: Path) -> None:
-    """Save the BEV features (N, C, H, W) in float16 and the samples of a split.
+    """Save the BEV features of the N samples of a split in float16 (N, C, H, W), and the samples.
 
     Args:
         cfg: Config of backbone, encoder and data.
@@ -171,14 +185,14 @@ def store_features(cfg: Config, checkpoint: str, part: str, path: Path) -> None:
         part: Split, ``train`` or ``val``.
         path: File to write.
     """
-    with building(cfg):
+    with building(cfg):  # adds the name of the config to errors
         model = MODELS.build(cfg.model).eval()
     load_weights(model, checkpoint)
     dataset = DATASETS.build(cfg[f"{part}_dataloader"].dataset)
     feats = []
     samples = []
     for index in range(len(dataset)):
-        batch = model.data_preprocessor(pseudo_collate([dataset[index]]))
+        batch = model.data_preprocessor(pseudo_collate([dataset[index]]))  # one sample
         bev = model.extract_feat(batch["inputs"], batch["data_samples"])["bev_feats"]
         feats.append(bev[0].half())
         samples += batch["data_samples"]
@@ -202,42 +216,46 @@ def train_and_test(
     Returns:
         Values of both metrics by key, such as ``chamfer/mAP``.
     """
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # several tasks may run in parallel
     torch.manual_seed(task.seed)
     cfg = read_config(task.config, task.options)
-    with building(cfg):
+    with building(cfg):  # adds the name of the config to errors
         model = MODELS.build(cfg.model)
     model.init_weights()
     if not args.from_scratch:
         load_weights(model, args.checkpoint)
     head = model.map_head.train()
-    settings = cfg.optim_wrapper
+    optim_cfg = cfg.optim_wrapper
     optimizer = torch.optim.AdamW(
-        head.parameters(), lr=args.lr, weight_decay=settings.optimizer.weight_decay, fused=True
+        head.parameters(), lr=args.lr, weight_decay=optim_cfg.optimizer.weight_decay, fused=True
     )
     warm_up = LinearLR(optimizer, start_factor=0.1, total_iters=WARM_UP)
     decay = CosineAnnealingLR(
         optimizer, T_max=max(1, args.iterations - WARM_UP), eta_min=args.lr / 100
     )
     schedule = SequentialLR(optimizer, [warm_up, decay], milestones=[WARM_UP])
-    data = torch.load(features["train"], weights_only=False, mmap=True)
+    # The file contains samples, not only tensors. With `mmap`, features are read when they are
+    # used.
+    train_data = torch.load(features["train"], weights_only=False, mmap=True)
+    # A separate generator, so that the order of the batches does not depend on the head.
     generator = torch.Generator().manual_seed(task.seed)
     batches: list[torch.Tensor] = []
     for _ in range(args.iterations):
         if not batches:
-            order = torch.randperm(len(data["samples"]), generator=generator)
-            batches = list(order.split(args.batch))
-        rows = batches.pop()
-        inputs = {"bev_feats": data["feats"][rows].float()}
-        losses = head.loss(inputs, [data["samples"][i] for i in rows.tolist()])
+            order = torch.randperm(len(train_data["samples"]), generator=generator)
+            batches = list(order.split(args.batch))  # batches of the next epoch
+        sample_inds = batches.pop()
+        inputs = {"bev_feats": train_data["feats"][sample_inds].float()}
+        losses = head.loss(inputs, [train_data["samples"][i] for i in sample_inds.tolist()])
         optimizer.zero_grad(set_to_none=True)
+        # Other entries of `losses` are statistics.
         terms = [value for name, value in losses.items() if "loss" in name]
         sum(terms).backward()
-        torch.nn.utils.clip_grad_norm_(head.parameters(), settings.clip_grad.max_norm)
+        torch.nn.utils.clip_grad_norm_(head.parameters(), optim_cfg.clip_grad.max_norm)
         optimizer.step()
         schedule.step()
-    data = torch.load(features["val"], weights_only=False, mmap=True)
-    return test(model, data, results=task.results)
+    val_data = torch.load(features["val"], weights_only=False, mmap=True)
+    return test(model, val_data, results=task.results)
 
 
 @torch.no_grad()
@@ -252,7 +270,8 @@ def test(model: Any, data: dict[str, Any], results: Path) -> dict[str, float]:
     Returns:
         Values of both metrics by key, such as ``chamfer/mAP``.
     """
-    # The metric logs a table at level INFO. This logger drops it.
+    # The metric writes a table of level INFO to the logger that was created last. This logger drops
+    # it.
     MMLogger.get_instance("heads", log_level="ERROR")
     model.eval()
     metric = METRICS.build({"type": "MapMetric", "eval": METRIC_NAMES, "out_file": str(results)})

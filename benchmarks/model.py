@@ -23,8 +23,8 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
 from gsmap.utils.errors import InputError
 
-# Transforms that make targets from images, cameras or LiDAR, which random inputs lack. Random
-# targets of `add_auxiliary_targets` take their place.
+# Transforms whose targets are replaced by random ones (`add_auxiliary_targets`). Camera masks and
+# depth would need camera or LiDAR data, which random samples lack.
 RANDOM_TARGETS = {"MakeBEVMask", "MakePVMask", "MakeDepthMap"}
 
 
@@ -58,7 +58,7 @@ def measure_each(
 
     On a CPU each call runs in a separate process, because memory that an earlier model leaves in
     the allocator would count as memory of the next model. On a GPU the calls run in this process,
-    because torch counts the memory of the GPU.
+    because torch counts only the memory of tensors that are in use.
 
     Args:
         task: Function that can be pickled.
@@ -70,9 +70,9 @@ def measure_each(
     on_cpu = all(args.device == "cpu" for _, args, *_ in arguments)
     call = partial(in_own_process, task) if on_cpu else task
     costs = []
-    for values in arguments:
-        config_file = values[0]
-        costs.append((config_file, call(*values)))
+    for call_arguments in arguments:
+        config_file = call_arguments[0]
+        costs.append((config_file, call(*call_arguments)))
     return costs
 
 
@@ -97,14 +97,17 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
         pixel_m = ((x_max - x_min) / columns, (y_max - y_min) / rows)
         cfg.model.map_head.masks = {"pixel_m": pixel_m}
     if cfg.model.get("img_backbone"):
-        cfg.model.img_backbone.init_cfg = None
+        cfg.model.img_backbone.init_cfg = None  # no pretrained weights, which may be downloads
     torch.manual_seed(0)
     with building(cfg):  # adds the names of the config and of its parts to errors
         return MODELS.build(cfg.model).to(args.device)
 
 
 def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
-    """Number and size of the images that a config's network takes, padding included.
+    """Number and size of the images that a config's network takes.
+
+    A size in the options or in the config's ``ScaleImages`` is returned as it is. Otherwise, the
+    size of the image files (``_file_size``) is scaled and padded as in the config.
 
     Args:
         path: Config file.
@@ -114,7 +117,8 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
         Number of cameras, image rows and columns.
 
     Raises:
-        ValueError: If the config does not state the size of its image files.
+        ValueError: If the options have no ``size``, and the config does not state the size of its
+            image files.
     """
     cfg = read_config(path)
     dataset = cfg.test_dataloader.dataset
@@ -130,7 +134,7 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
             scaling = step
             break
     if scaling.get("size"):
-        width, height = scaling["size"]
+        width, height = scaling["size"]  # a config has the width first
         return cameras, height, width
     scale = scaling.get("scale", 1.0)
     divisor = cfg.model.data_preprocessor.get("pad_size_divisor", 1)
@@ -143,7 +147,7 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
 
 
 def mask_stride(path: str) -> int:
-    """Edge of a cell of a config's camera masks in image pixels."""
+    """Edge of a cell of a config's camera masks in image pixels; a default without such masks."""
     pipeline = read_config(path).train_dataloader.dataset.pipeline
     for step in pipeline:
         if step.type == "MakePVMask":
@@ -157,7 +161,7 @@ def model_and_batch(
     """Build a config's model and random inputs for it.
 
     The inputs are normalised images of cameras in a ring, and straight elements as ground truth.
-    Each sample belongs to another scene (see `advance_samples`).
+    Each sample belongs to another scene, so temporal models treat the samples as separate streams.
 
     Args:
         path: Config file.
@@ -168,7 +172,8 @@ def model_and_batch(
         num_elements: Number of elements in each sample's ground truth.
 
     Returns:
-        The model; the inputs, with images ``imgs`` (B, V, 3, H, W); and the samples.
+        The model; the inputs, with images ``imgs`` (B, V, 3, H, W); and the samples, with elements
+        and all targets that the training of the model needs.
     """
     model = build(path, args, raster=raster)
     shape = image_shape(path, args)
@@ -190,6 +195,7 @@ def model_and_batch(
         "lidar2global": np.eye(4),
     }
     grid = model.map_head.grid
+    # Heads without a fixed number of points get the two ends of each straight element.
     num_points = getattr(model.map_head, "num_points", 2)
     num_classes = len(model.map_head.classes)
     steps = torch.linspace(0, 1, num_points)[:, None]
@@ -202,8 +208,8 @@ def model_and_batch(
         instances = InstanceData(
             labels_3d=labels,
             pts=pts,
-            pts_shifts=torch.stack([pts, pts.flip(1)], dim=1),
-            polylines=pts,
+            pts_shifts=torch.stack([pts, pts.flip(1)], dim=1),  # both directions: (K, 2, P, 2)
+            polylines=pts,  # elements before resampling
         )
         sample.gt_instances_3d = instances.to(args.device)
         add_auxiliary_targets(sample, model, shape=shape, stride=stride, generator=generator)
@@ -214,7 +220,7 @@ def model_and_batch(
 
 def advance_samples(samples: Sequence[Det3DDataSample]) -> None:
     """Advance samples by half a second and 4 m, in place; temporal models expect the next frame."""
-    step = rigid(np.eye(3), [0.0, 4.0, 0.0])
+    step = rigid(np.eye(3), [0.0, 4.0, 0.0])  # forward in the sensor frame, hence on the right
     for sample in samples:
         sample.set_metainfo(
             {
@@ -233,10 +239,11 @@ def add_config_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> Non
         grid: Grid of the head.
     """
     cfg = read_config(path)
-    transforms = needed_targets(cfg).keys() - RANDOM_TARGETS
+    transforms = needed_targets(cfg).keys() - RANDOM_TARGETS  # names of transforms
     instances = sample.gt_instances_3d
     labels = instances.labels_3d.tolist()
     polylines = instances.polylines.cpu().numpy()
+    # Fields that the transforms read, as in the results of the pipeline.
     results = {
         "token": sample.token,
         "x_range": grid.x_range,
@@ -248,7 +255,7 @@ def add_config_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> Non
         if step.type in transforms:
             results = TRANSFORMS.build(step).transform(results)
     for name, value in results.items():
-        if name.startswith("gt_"):
+        if name.startswith("gt_"):  # the targets, and the elements themselves
             setattr(sample, name, value)
 
 
@@ -259,7 +266,10 @@ def add_auxiliary_targets(
     stride: int,
     generator: torch.Generator,
 ) -> None:
-    """Add random targets of auxiliary heads: masks of every class, and depth, in place.
+    """Add random targets of auxiliary heads to a sample, in place.
+
+    The targets are BEV masks ``gt_seg`` (classes, H, W), camera masks ``gt_pv_seg``
+    (V, classes, h, w), and depths ``gt_depth`` in metres (V, rows, columns).
 
     Args:
         sample: Sample to which the targets are added.
@@ -290,6 +300,7 @@ def ring_of_cameras(num_cams: int, height: int, width: int) -> np.ndarray:
     Returns:
         Transforms from the sensor frame (x right, y forward, z up) to pixels. (V, 4, 4)
     """
+    # A focal length of half the width gives a field of view of 90 degrees.
     intrinsics = np.eye(4)
     intrinsics[:3, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]]
     matrices = []

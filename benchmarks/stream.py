@@ -10,7 +10,7 @@ from gsmap.engine.arguments import parse_options
 from gsmap.engine.launch import read_config
 from gsmap.utils.errors import InputError
 
-_IMAGES = (64, 96)  # rows and columns: the state does not depend on them
+_IMAGE_SIZE = (64, 96)  # rows and columns; small, because the state does not depend on them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +34,9 @@ def run(args: argparse.Namespace) -> None:
 def state_bytes(config: str, options: list[str]) -> dict[str, int]:
     """Size of each part of a stream's state.
 
+    A stream is a sequence of frames of one drive. Its state, the memory of the model, is all
+    tensors that the model computes in a frame and reads in the next one. Each tensor is a part.
+
     Args:
         config: Config file.
         options: Overrides of the config, each ``KEY=VALUE``.
@@ -48,13 +51,16 @@ def state_bytes(config: str, options: list[str]) -> dict[str, int]:
     cfg = read_config(config, cfg_options)
     if cfg.model.get("img_backbone"):
         cfg.model.img_backbone.init_cfg = None  # loads no pretrained weights
-    with building(cfg):
+    with building(cfg):  # adds the name of the config to errors
         model = MODELS.build(cfg.model).eval()
     if model.temporal is None:
         raise InputError(f"{config} has no memory: give --cfg-options model.temporal=...")
     exported = ExportedDetector(model)
-    inputs = exported.example_inputs(len(cfg.test_dataloader.dataset.cameras), _IMAGES)
-    state = inputs[len(inputs) - len(exported.memory) :]  # the state comes last among the inputs
+    num_cams = len(cfg.test_dataloader.dataset.cameras)
+    # This call runs the model on a frame. It sets `exported.memory`, the names of the parts, so it
+    # must come first. The parts are the last tensors of the inputs, in the order of their names.
+    inputs = exported.example_inputs(num_cams, _IMAGE_SIZE)
+    state = inputs[len(inputs) - len(exported.memory) :]
     sizes = {}
     for name, value in zip(exported.memory, state, strict=True):
         sizes[name] = value.numel() * value.element_size()

@@ -25,6 +25,12 @@ from gsmap.utils.words import format_count
 def merge_matches(path: Path, shards: list[ShardFile]) -> int:
     """Compute the metrics of all shards together, write them to a file and print them.
 
+    The notes of the shards are printed, too.
+
+    Args:
+        path: File to write, as JSON.
+        shards: All parts, each with the matches of its samples.
+
     Returns:
         The number of samples of all shards.
     """
@@ -37,10 +43,13 @@ def merge_matches(path: Path, shards: list[ShardFile]) -> int:
     return sum(shard.manifest["samples"] for shard in shards)
 
 
+# Functions that join the parts (shards) of a kind of file. They take the path of the file and the
+# parts, and return the number of samples.
 MERGE = {ANNOTATIONS: merge_annotations, RESULTS: merge_results, MATCHES: merge_matches}
 
 
 def main(argv: list[str] | None = None) -> str:
+    """Join the parts of each file; return a line for each, which `run_command` prints."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("targets", metavar="FILE", type=output_file, nargs="+", help="file to make")
     parser.add_argument(
@@ -55,7 +64,7 @@ def main(argv: list[str] | None = None) -> str:
         import_module(module)
     lines = []
     for target in args.targets:
-        shards = find_shards(target)
+        shards = find_shards(target)  # raises an error if one is missing or differs from the others
         kind = shards[0].manifest["kind"]
         if kind not in MERGE:
             raise InputError(f"{shards[0].path} holds {kind!r}, which cannot be joined.")

@@ -53,17 +53,29 @@ def parse_args() -> argparse.Namespace:
 
 
 def choose_start(cfg: Config, resume: str | None) -> None:
-    """Set and check the checkpoint from which the run resumes or takes its initial weights."""
+    """Set and check the checkpoint from which the run resumes or takes its initial weights.
+
+    Args:
+        cfg: Config of the run; ``resume`` and ``load_from`` are set. With ``resume``, the run also
+            continues with the optimizer and the number of iterations in the checkpoint.
+        resume: Value of ``--resume``: a checkpoint, ``auto`` for the newest one in the work folder,
+            or None to start a training.
+
+    Raises:
+        FileNotFoundError: If the checkpoint does not exist.
+        ValueError: If the checkpoint cannot be loaded, or the run would replace it.
+    """
     from gsmap.checkpoints.reading import read_weights
     from gsmap.engine.launch import newest_checkpoint
 
     if resume == "auto":
-        newest = newest_checkpoint(cfg.work_dir, read_weights)
+        newest = newest_checkpoint(cfg.work_dir, read_weights)  # skips files that cannot be read
         if newest is None and is_first_rank():
             print(f"{cfg.work_dir} holds no checkpoint: the run starts at its beginning.")
         resume = newest
     cfg.resume = resume is not None
     cfg.load_from = resume or cfg.get("load_from")
+    # The runner downloads an address. Files and names of models are checked here.
     if cfg.load_from and "://" not in str(cfg.load_from):
         cfg.load_from = str(find_checkpoint(cfg.load_from))
         read_weights(cfg.load_from)  # raises an error for a file that cannot be loaded
@@ -75,7 +87,11 @@ def choose_start(cfg: Config, resume: str | None) -> None:
 
 
 def lock_work_dir(work_dir: str) -> AbstractContextManager:
-    """Lock the work folder for this run. The first rank locks it for all ranks."""
+    """Lock the work folder for this run. The first rank locks it for all ranks.
+
+    Returns:
+        Context manager that unlocks the folder at its end; without effect in other ranks.
+    """
     if not is_first_rank():
         return nullcontext()
     advice = "wait for its end, or give another --work-dir"
@@ -84,6 +100,7 @@ def lock_work_dir(work_dir: str) -> AbstractContextManager:
 
 def main() -> None:
     args = parse_args()
+    # Imported after the options are parsed, because these imports are slow.
     import torch
     from mmdet3d.registry import RUNNERS
 
@@ -96,12 +113,12 @@ def main() -> None:
         args.work_dir = str(Path("work_dirs") / f"{Path(args.config).stem}_overfit")
     cfg = load_config(args)
     if args.overfit is not None:
-        overfit(cfg, args.overfit, args.overfit_iterations)
+        overfit(cfg, args.overfit, args.overfit_iterations)  # changes the config in place
     if args.amp and torch.cuda.is_available():
-        cfg.optim_wrapper.type = "MapAmpOptimWrapper"
+        cfg.optim_wrapper.type = "MapAmpOptimWrapper"  # float16, with a scaled loss
         cfg.optim_wrapper.setdefault("loss_scale", "dynamic")
     elif args.amp:
-        cfg.optim_wrapper.type = "CPUAutocastOptimWrapper"
+        cfg.optim_wrapper.type = "CPUAutocastOptimWrapper"  # bfloat16
     if args.auto_scale_lr:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
             raise InputError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
@@ -109,7 +126,7 @@ def main() -> None:
     with lock_work_dir(cfg.work_dir):
         choose_start(cfg, args.resume)
         runner_type = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
-        with building(cfg):
+        with building(cfg):  # adds the names of the config and of its parts to errors
             runner = runner_type.from_cfg(cfg)
             runner.train()
 

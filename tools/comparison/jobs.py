@@ -37,7 +37,7 @@ def devices() -> list[str | None]:
 
 
 def machine() -> str:
-    """Number and name of the GPUs, or of the processor cores if there is no GPU."""
+    """Number and name of the GPUs, or of the usable processor cores if there is no GPU."""
     if torch.cuda.is_available():
         return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name()}"
     model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
@@ -64,10 +64,14 @@ class Job:
         self.device = device
         comparison_folder = run.folder.parent.parent  # of <comparison>/<name>/seed_<seed>
         require_no_link(run.folder, below=comparison_folder)
+        # The open lock file keeps the folder locked until `end` closes it.
         self._lock = lock_folder(run.folder, name=".lock", advice="wait for its end")
+        # A later start of the run compares its settings with this file.
         write_text(run.folder / SETTINGS, json.dumps(plain(run.settings), indent=1))
+        # Contents of the file `RECORD`. The load is the system's mean number of busy processes in
+        # the last minute, which affects the times.
         self.record: dict[str, Any] = {"machine": machine(), "load_at_start": os.getloadavg()[0]}
-        for stage, command in run.commands().items():
+        for stage, command in run.commands().items():  # stages "train" and "test"
             self.record[stage] = shlex.join(command)
         self._peak_mib = 0
         self.stage = "test" if run.is_trained else "train"
@@ -101,7 +105,7 @@ class Job:
         """Start the test if the training has ended; record the end of the test or a failure.
 
         Returns:
-            Whether the job has ended.
+            Whether the job has ended, by success or failure. Its state is then in ``record``.
         """
         if not self._collect_process():
             return False
@@ -144,7 +148,8 @@ class Job:
         """End the job: kill its process if it runs, record the state and unlock the folder.
 
         Args:
-            state: ``done``, or a sentence about the failure.
+            state: ``done``, a sentence about the failure, or ``cut off`` if the command ends before
+                the job.
         """
         if self._process.returncode is None:
             self._process.kill()
@@ -158,6 +163,8 @@ class Job:
 def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
     """Train and test the unfinished runs, one after another on each device.
 
+    If the caller ends early, the running jobs are killed and recorded as ``cut off``.
+
     Args:
         runs: Runs of the comparison, including finished ones.
 
@@ -165,7 +172,7 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
         Each run when it has ended, with its state: ``done``, or a sentence about the failure.
     """
     waiting = deque(run for run in runs if not run.is_done)
-    jobs: dict[str | None, Job] = {}
+    jobs: dict[str | None, Job] = {}  # the running job of each device
     usable_devices = devices()
     initial = sum(run.iterations_so_far for run in runs)
     total = sum(run.iterations for run in runs)
@@ -182,7 +189,7 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
                 for device in usable_devices:
                     if device not in jobs and waiting:
                         jobs[device] = Job(waiting.popleft(), device)
-                for job in list(jobs.values()):
+                for job in list(jobs.values()):  # a copy, since jobs that end are removed
                     if job.poll():
                         del jobs[job.device]
                         yield job.run, job.record["state"]

@@ -11,7 +11,8 @@ from gsmap.structures.elements import FloatArray
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
-_FARTHEST_M = 100_000.0  # largest distance of a position from the origin
+# Largest absolute x and y of a map around an origin. Coordinates of a map grid are usually larger.
+_FARTHEST_M = 100_000.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,11 @@ class MapOrigin:
 
     @cached_property
     def _projection(self) -> Any:
-        """Projection from degrees to metres, whose coordinates at the origin may not be zero."""
+        """Projection from degrees to metres (transverse Mercator).
+
+        Its coordinates at the origin are not zero for a UTM zone, so callers subtract them. Raises
+        RuntimeError if ``pyproj``, which the extra ``maps`` installs, is missing.
+        """
         create_projection = import_extra("pyproj", "maps").Proj
         if self.utm_zone is not None:
             return create_projection(proj="utm", zone=self.utm_zone, ellps="WGS84")
@@ -60,11 +65,13 @@ class MapOrigin:
 
         Raises:
             ValueError: If a point is too far from the origin for the projection.
+            RuntimeError: If ``pyproj`` is missing.
         """
-        east, north = self._projection(self.longitude_deg, self.latitude_deg)
+        origin_x, origin_y = self._projection(self.longitude_deg, self.latitude_deg)
         x, y = np.asarray(points)[:, :2].T
-        lon_deg, lat_deg = self._projection(x + east, y + north, inverse=True)
+        lon_deg, lat_deg = self._projection(x + origin_x, y + origin_y, inverse=True)
         degrees = np.stack([lon_deg, lat_deg], axis=1)
+        # The projection returns infinity for a point without longitude and latitude.
         if not np.isfinite(degrees).all():
             farthest_m = max(np.abs(x).max(), np.abs(y).max())
             raise InputError(
@@ -85,12 +92,14 @@ class MapOrigin:
             Points in metres. (n, 2)
 
         Raises:
-            ValueError: If a value is out of range, or farther than 100 km from the origin.
+            ValueError: If a longitude or latitude is out of range, or x or y of a point is larger
+                than 100 km.
+            RuntimeError: If ``pyproj`` is missing.
         """
         longitude_deg, latitude_deg = _require_degrees(lon_lat, where).T
-        origin = self._projection(self.longitude_deg, self.latitude_deg)
+        origin_xy = self._projection(self.longitude_deg, self.latitude_deg)
         x, y = self._projection(longitude_deg, latitude_deg)
-        points = np.stack([x, y], axis=1) - origin
+        points = np.stack([x, y], axis=1) - origin_xy
         farthest_m = np.abs(points).max(initial=0.0)
         if not farthest_m <= _FARTHEST_M:  # `not <=` is also true of NaN
             raise InputError(
@@ -105,6 +114,9 @@ class MapOrigin:
 class MapGrid:
     """Coordinate reference system of a global frame that is a map grid.
 
+    A map grid is a standard projection with coordinates in metres, such as a UTM zone. It takes the
+    place of a `MapOrigin`.
+
     Args:
         crs: Name of the system for ``pyproj``, such as ``EPSG:32650``. The easting of the system is
             x of the global frame, and its northing is y.
@@ -117,12 +129,12 @@ class MapGrid:
     crs: str
 
     def __post_init__(self) -> None:
-        crs = import_extra("pyproj", "maps").CRS
+        crs_class = import_extra("pyproj", "maps").CRS
         try:
-            system = crs.from_user_input(self.crs)
+            system = crs_class.from_user_input(self.crs)
         except Exception as error:  # CRSError, which is not a ValueError
             raise InputError(f"{self.crs} is no coordinate reference system: {error}.") from error
-        units = {axis.unit_name for axis in system.axis_info[:2]}
+        units = {axis.unit_name for axis in system.axis_info[:2]}  # of the two horizontal axes
         if not system.is_projected or units != {"metre"}:
             raise InputError(
                 f"{self.crs} ({system.name}) is no grid in metres: give the grid of the poses, "
@@ -141,15 +153,19 @@ class MapGrid:
 
         Raises:
             ValueError: If a position has no longitude and latitude, or if it is outside of the area
-                of the grid. The area is not checked if a coordinate is larger than 100 km.
+                of the grid. The area is not checked if a coordinate is larger than 100 km, because
+                metres from another origin are smaller.
         """
         points = np.asarray(positions)[:, :2]
         system = import_extra("pyproj", "maps").CRS.from_user_input(self.crs)
         lon_deg, lat_deg = self.lon_lat(points).T
         is_wrong = ~(np.isfinite(lon_deg) & np.isfinite(lat_deg))
-        area = system.area_of_use
+        area = system.area_of_use  # bounds in degrees; None if the system has no known area
         if area is not None and np.abs(points).max(initial=0.0) <= _FARTHEST_M:
-            # pyproj returns infinity for a point without a longitude; its remainder is NaN.
+            # Longitudes are measured eastward from the western bound, because an area may cross the
+            # meridian of 180 degrees, where its eastern bound is smaller than its western bound.
+            # pyproj returns infinity for a point without a longitude. Its remainder is NaN, without
+            # a warning of numpy.
             with np.errstate(invalid="ignore"):
                 from_west_deg = (lon_deg - area.west) % 360.0
             width_deg = (area.east - area.west) % 360.0
@@ -167,8 +183,9 @@ class MapGrid:
 
     @cached_property
     def _transformer(self) -> Any:
-        """Transformation from the grid to longitude and latitude."""
+        """Transformation from the grid (easting, northing) to longitude and latitude on WGS 84."""
         pyproj = import_extra("pyproj", "maps")
+        # EPSG:4326 lists the latitude first. `always_xy` selects the order (longitude, latitude).
         return pyproj.Transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
 
     def lon_lat(self, points: FloatArray) -> FloatArray:
@@ -178,7 +195,7 @@ class MapGrid:
             points: Points in metres of the grid. (n, >= 2)
 
         Returns:
-            Longitude and latitude in degrees. (n, 2)
+            Longitude and latitude in degrees; infinite for a point that has none. (n, 2)
         """
         x, y = np.asarray(points)[:, :2].T
         lon_deg, lat_deg = self._transformer.transform(x, y)
@@ -195,7 +212,8 @@ class MapGrid:
             Points in metres. (n, 2)
 
         Raises:
-            ValueError: If a value is out of range, or not in the area of the grid.
+            ValueError: If a longitude or latitude is out of range, or a point has no coordinates in
+                the grid.
         """
         longitude_deg, latitude_deg = _require_degrees(lon_lat, where).T
         x, y = self._transformer.transform(longitude_deg, latitude_deg, direction="INVERSE")
@@ -251,6 +269,7 @@ def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:
     Returns:
         Origin, or None for other data sets and for maps that the devkit does not list.
     """
+    # The devkits are imported here, because each of them is needed for one data set only.
     if meta.dataset == "nuscenes":
         from nuscenes.scripts.export_poses import REFERENCE_COORDINATES
 

@@ -21,7 +21,8 @@ from gsmap.utils.json_items import items_of
 
 _ADVICE = "give a GeoJSON FeatureCollection"
 _KINDS = ("LineString", "MultiLineString", "Polygon", "MultiPolygon")
-# Marks a file without the member `crs`. The value None means that the member is null.
+# Marks a file without the member `crs` (coordinate reference system). None cannot mark it, because
+# it is the value of a member that is null.
 _NO_CRS = "no crs"
 # Names of the system of longitude and latitude on the WGS 84 ellipsoid end in one of these.
 _DEGREES = ("CRS84", "EPSG:4326", "EPSG::4326")
@@ -35,9 +36,10 @@ def read_geojson(
 ) -> MapFile:
     """Read a FeatureCollection of lines and polygons.
 
-    Coordinates are longitude and latitude (RFC 7946). With ``"crs": null`` they are metres of the
-    global frame. Lines and the outer rings of polygons become map elements. A feature can have
-    several lines or polygons. Heights are dropped. Features of other kinds are only counted.
+    A feature is a geometry with properties. Coordinates are longitude and latitude (RFC 7946). With
+    ``"crs": null`` they are metres of the global frame. Lines and the outer rings of polygons
+    become map elements. A feature can have several lines or polygons. Heights are dropped. Features
+    of other kinds are only counted.
 
     Args:
         path: File, which may be untrusted.
@@ -51,14 +53,17 @@ def read_geojson(
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file is malformed, a number is not finite or out of range, degrees have
-            no origin, or no feature can be used.
+        ValueError: If the file is malformed or has too many vertices, a number is not finite or out
+            of range, coordinates are in another system, degrees have no origin, or the file has
+            features but none of them can be used.
         RuntimeError: If coordinates are degrees and ``pyproj`` is missing.
     """
     path = Path(path)
     collector = ElementCollector(path, classes, rule=rule or ClassRule(CLASS_KEY))
     members: dict[str, Any] = {"crs": _NO_CRS}
-    # Reading the features also fills `members` with the other members of the file.
+    # `items_of` reads the features one by one, each with its place in the file. It also sets the
+    # members of the file that are keys of `members`. They may follow the features, so `crs` is
+    # known only after the loop.
     features = items_of(path, "features", _ADVICE, other_entries=members)
     for number, (feature, _) in enumerate(features):
         try:
@@ -80,10 +85,15 @@ def read_geojson(
 
 
 def _require_degrees(crs: Any, path: Path) -> None:
-    """Require that the coordinate system of a file is longitude and latitude, if it names one."""
+    """Require that the coordinate system of a file is longitude and latitude, if it names one.
+
+    Raises:
+        ValueError: If the file names another system.
+    """
     if crs == _NO_CRS:
         return
     name = None
+    # The member has the form {"type": "name", "properties": {"name": ...}}.
     if isinstance(crs, dict) and isinstance(crs.get("properties"), dict):
         name = crs["properties"].get("name")
     if not isinstance(name, str) or not name.upper().endswith(_DEGREES):
@@ -94,7 +104,12 @@ def _require_degrees(crs: Any, path: Path) -> None:
 
 
 def _add_feature(feature: Any, collector: ElementCollector) -> None:
-    """Add the lines of a feature to the collector, or count the feature as unused."""
+    """Add the lines of a feature to the collector, or count the feature as unused.
+
+    Raises:
+        ValueError: If the feature is malformed. The message is a clause without file and feature,
+            which `read_geojson` adds.
+    """
     if not isinstance(feature, dict) or feature.get("type") != "Feature":
         raise InputError("it is no object of type Feature")
     geometry = feature.get("geometry")
@@ -111,33 +126,35 @@ def _add_feature(feature: Any, collector: ElementCollector) -> None:
         collector.unused[f"geometry {kind[:40]!r}"] += 1
         return
     name = collector.class_of(properties or {})
-    if name is None:
+    if name is None:  # `class_of` has counted the feature as unused
         return
     score = _score_of(properties or {})
     coordinates = geometry.get("coordinates")
-    parts = _list_of(coordinates) if kind.startswith("Multi") else [coordinates]
-    for part in parts:
+    shapes = _list_of(coordinates) if kind.startswith("Multi") else [coordinates]
+    for shape in shapes:  # coordinates of one line, or of one polygon
         if kind.endswith("Polygon"):
-            rings = _list_of(part)
+            rings = _list_of(shape)  # the outer ring, then the holes
             collector.add(name, _outer_ring(rings), score=score)
             collector.unused["holes of polygons"] += len(rings) - 1
         else:
-            collector.add(name, _line_of(part), score=score)
+            collector.add(name, _line_of(shape), score=score)
 
 
 def _score_of(properties: Mapping[str, Any]) -> float:
     """Return the property ``score`` if it is a number in [0, 1], and 1 otherwise."""
     score = properties.get("score")
+    # True and False are integers in Python.
     if isinstance(score, bool) or not isinstance(score, (int, float)):
         return 1.0
     return float(score) if 0 <= score <= 1 else 1.0
 
 
 def _outer_ring(rings: list[Any]) -> FloatArray:
-    """Convert the first ring of a polygon to an array. (n, 2)"""
+    """Convert the first ring of a polygon, its outline, to an array. (n, 2)"""
     if not rings:
         raise InputError("its polygon has no ring")
     outer = _line_of(rings[0])
+    # A closed triangle has four positions.
     if len(outer) < 4 or not np.array_equal(outer[0], outer[-1]):
         raise InputError("the ring of its polygon is not closed")
     return outer
@@ -151,7 +168,7 @@ def _list_of(value: Any) -> list[Any]:
 
 
 def _line_of(positions: Any) -> FloatArray:
-    """Convert positions to an array without heights. (n, 2)"""
+    """Convert positions, lists of two or more coordinates, to an array without heights. (n, 2)"""
     points = []
     for position in _list_of(positions):
         coordinates = _list_of(position)
@@ -160,4 +177,4 @@ def _line_of(positions: Any) -> FloatArray:
         x = finite_number(coordinates[0])
         y = finite_number(coordinates[1])
         points.append((x, y))
-    return np.array(points, dtype=np.float64).reshape(-1, 2)
+    return np.array(points, dtype=np.float64).reshape(-1, 2)  # the shape (0, 2) without positions

@@ -1,4 +1,9 @@
-"""Changes of the lines of one class between an old map and later drives (passes)."""
+"""Changes of the lines of one class between an old map and later drives (passes).
+
+Lines are sampled densely (`DenseLines`), so that a change can be a part of a line. A part is a
+slice of the vertices of one line. A vertex of an old line is matched with the nearest line of
+similar direction in every other frame; its distance from this line is its shift in the frame.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -72,13 +77,13 @@ class _Evidence:
 
     @property
     def is_missing(self) -> BoolArray:
-        """Whether most passes with a vertex in view do not detect it. (M,)"""
+        """Whether most passes with a vertex in view do not detect it; False without any. (M,)"""
         num_missing = (self.is_in_view & ~self.is_seen).sum(axis=0)
         return 2 * num_missing > self.is_in_view.sum(axis=0)
 
     @property
     def is_present(self) -> BoolArray:
-        """Whether most passes with a vertex in view detect it. (M,)"""
+        """Whether most passes with a vertex in view detect it; False without any. (M,)"""
         num_seen = (self.is_in_view & self.is_seen).sum(axis=0)
         return 2 * num_seen > self.is_in_view.sum(axis=0)
 
@@ -98,6 +103,7 @@ class _Evidence:
         """
         in_view = self.is_in_view[:, part]  # (passes, n)
         num_in_view = in_view.sum(axis=1)
+        # Vertices in view that a pass detects if ``seen`` is True, or else misses.
         num_agreeing = (in_view & (self.is_seen[:, part] == seen)).sum(axis=1)
         num_vertices = in_view.shape[1]
         has_part = 2 * num_in_view > num_vertices
@@ -126,7 +132,8 @@ def line_changes(
     if not len(lines.points):
         return _added(old, passes, label)
     predictions = [dense_predictions(one_pass.drive, label, config) for one_pass in passes]
-    # The old lines come first, so their vertices have the indices 0 to `num_old` - 1.
+    # Joined lines keep their frames apart; the old lines count as one frame. They come first, so
+    # their vertices have the indices 0 to `num_old` - 1.
     joined = join_lines([lines, *predictions])
     normals = normals_of(joined)
     num_old = len(lines.points)
@@ -141,8 +148,8 @@ def line_changes(
         in_view, num_agreeing = evidence.count_passes(part, seen=False)
         if not num_agreeing:
             continue
-        # Mean number of frames in which a vertex of the part is not detected. A frame with a match
-        # of score s counts as 1 - s such frames.
+        # Mean number of frames in which a vertex of the part is in range and not detected. A frame
+        # with a match of score s counts as 1 - s such frames.
         num_without = float((views - support)[part].mean())
         old_score = float(lines.scores[part].mean())
         change = Change(
@@ -194,7 +201,7 @@ class _Moves:
 
     def shift_of(self, part: slice) -> Shift | None:
         """Mean distance over a part of an old line, and its error; None if too few frames match."""
-        # `_by_frame` treats the map of a pass as one frame.
+        # In `maps`, the map of a pass is one frame, so the result has one entry per pass.
         by_pass = _by_frame(self.maps, _within(self.map_matches, part))
         by_frame = _by_frame(self.frames, _within(self.frame_matches, part))
         if len(by_frame.distances) < _MIN_FRAMES:
@@ -234,8 +241,11 @@ def _moved(
         lines: Old lines, with M vertices in all.
         normals: Unit vector to the left of each vertex of the old lines. (M, 2)
         moves: Distances of the new lines.
-        evidence: Views of the vertices of the old lines.
+        evidence: Evidence of the passes for the vertices of the old lines.
         label: Index of the class.
+
+    Returns:
+        Changes of the parts whose shift is at least 0.5 m and significant (`Shift.exceeds`).
     """
     num_old = len(normals)
     # The shift of a vertex is its mean distance over the passes, smoothed along its line.
@@ -247,6 +257,7 @@ def _moved(
     support = np.bincount(matches.vertices, scores, minlength=num_old)
     views = evidence.views.sum(axis=0)
     changes = []
+    # Each side is searched alone, so that a part moved to one side only.
     for side in (1.0, -1.0):  # left and right
         has_moved = evidence.is_present & (side * shifts >= _MIN_MOVE_M)
         for part in _parts(lines, has_moved):
@@ -255,7 +266,7 @@ def _moved(
             if shift is None or not num_agreeing or not shift.exceeds(_MIN_MOVE_M):
                 continue
             share = smooth_share(float(support[part].mean()), float(views[part].mean()))
-            share *= float(lines.scores[part].mean())
+            share *= float(lines.scores[part].mean())  # confidence of the old line
             change = Change(
                 MOVED,
                 label,
@@ -271,7 +282,10 @@ def _moved(
 
 
 def _by_frame(joined: DenseLines, matches: Matches) -> _FrameDistances:
-    """Average the matches of each frame that has matches."""
+    """Average the matches of each frame that has matches.
+
+    The weight of a frame is the number of its matches times mean score over mean variance.
+    """
     # `rows` is the index of each match's frame among these frames, and `counts` is the number of
     # matches of each of these frames.
     _, rows = np.unique(joined.frames[matches.segments], return_inverse=True)
@@ -341,9 +355,10 @@ def _parts(lines: DenseLines, flags: BoolArray) -> list[slice]:
     parts = []
     for start, end in zip(lines.offsets[:-1].tolist(), lines.offsets[1:].tolist(), strict=True):
         smooth = median_filter(flags[start:end], _WINDOW, mode="nearest")
-        # Each run of true flags begins and ends with a change of the padded flags.
-        changes = np.flatnonzero(np.diff(np.r_[False, smooth, False]))
-        runs = start + changes.reshape(-1, 2)
+        # Each run of true flags begins and ends with a change of the padded flags, so the changes
+        # in pairs are the first vertex of a run and the vertex after its last one.
+        flag_changes = np.flatnonzero(np.diff(np.r_[False, smooth, False]))
+        runs = start + flag_changes.reshape(-1, 2)
         for first, last in runs.tolist():
             part = slice(first, last)
             is_whole = (first, last) == (start, end)

@@ -1,7 +1,8 @@
 """Rules that all readers of map files share.
 
 They find the class of an element, refuse files that are too large or have impossible coordinates,
-and count the elements that are not used.
+and count the elements that are not used. A reader creates an `ElementCollector`. For each element
+of the file it calls `class_of` and, if there is a class, `add`. At the end it calls `finish`.
 """
 
 import math
@@ -23,7 +24,7 @@ CLASS_KEY = "class"
 """Property with the class of an element in the files of `write_geojson` and `write_lanelet2`."""
 FARTHEST_M = 1e7
 """Largest coordinate of a vertex in metres of the global frame."""
-_MOST_VERTICES = 5_000_000
+_MOST_VERTICES = 5_000_000  # limits the memory that an untrusted file can take
 _SMALLEST_M2 = 0.01  # a ring with a smaller area is a point or a line and is not used
 _LONGEST_NAME = 60  # largest number of characters of a value in a message
 _LISTED_REASONS = 8  # largest number of reasons in a message
@@ -35,7 +36,8 @@ class MapFile(NamedTuple):
     Attributes:
         elements: Elements in metres in the global frame, labelled by the requested classes. Scores
             are 1 if the file has none.
-        unused: Number of elements of the file that are not used, by the reason.
+        unused: Number of elements of the file that are not used, by the reason, a text such as
+            ``divider without length``.
     """
 
     elements: MapElements
@@ -48,7 +50,8 @@ class ClassRule:
 
     Args:
         key: Name of the property, or of the tag in a Lanelet2 file.
-        class_of: Class of each value of the property; None if the values are names of classes.
+        class_of: Class of each value of the property. Elements with other values have no class.
+            None if the values are names of classes.
 
     Raises:
         ValueError: If ``key`` is empty.
@@ -71,11 +74,13 @@ class ClassRule:
             classes: Names of the classes.
 
         Raises:
-            ValueError: If a word after the first is not ``VALUE=CLASS``, or a class does not exist.
+            ValueError: If the first word is empty, a word after it is not ``VALUE=CLASS``, or a
+                class does not exist.
         """
         key, *pairs = words
         class_of = {}
         for pair in pairs:
+            # The last "=" separates the class, because a value may contain this character.
             value, separator, name = pair.rpartition("=")
             if not separator or not value or name not in classes:
                 raise InputError(
@@ -93,6 +98,9 @@ class ElementCollector:
         path: Path of the file, for messages.
         classes: Class names in label order.
         rule: Rule that finds the class of an element.
+
+    Attributes:
+        unused: Number of unused elements by the reason. Readers add further reasons.
     """
 
     def __init__(self, path: Path, classes: Sequence[str], rule: ClassRule) -> None:
@@ -115,6 +123,7 @@ class ElementCollector:
             Name of the class. If the rule finds no class, None; the element then counts as unused.
         """
         value = values.get(self._rule.key)
+        # The values of a rule are texts, and JSON files may have numbers.
         if isinstance(value, (int, float)):
             value = str(value)
         if not isinstance(value, str):
@@ -131,8 +140,8 @@ class ElementCollector:
 
         Args:
             name: Class of the element.
-            line: Finite vertices in degrees or metres. The last vertex of an area must be equal to
-                its first vertex. (n, 2)
+            line: Finite vertices, in degrees for all elements of the file or in metres for all of
+                them. The last vertex of an area must be equal to its first vertex. (n, 2)
             score: Confidence in [0, 1].
 
         Raises:
@@ -144,6 +153,7 @@ class ElementCollector:
                 f"{self._path} has more than {_MOST_VERTICES:,} vertices: cut out the part of the "
                 "map that you need."
             )
+        # A line has a length if the range (largest minus smallest) of x or of y is not zero.
         has_length = len(line) > 1 and bool(np.ptp(line, axis=0).any())
         if not has_length:
             self.unused[f"{name} without length"] += 1
@@ -165,9 +175,13 @@ class ElementCollector:
             origin: Position of the global frame on the Earth for lines in degrees; None for lines
                 in metres.
 
+        Returns:
+            The map. It is empty if the file has no elements, or only areas that are too small.
+
         Raises:
             ValueError: If a coordinate is out of range, or the file has elements but none of them
-                can be used.
+                was added.
+            RuntimeError: If lines are in degrees and ``pyproj`` is missing.
         """
         if not self._lines and self.unused:
             raise InputError(
@@ -179,6 +193,7 @@ class ElementCollector:
         scores = []
         rows = zip(self._lines, self._labels, self._scores, strict=True)
         for line, label, score in rows:
+            # Metres in the global frame. (n, 2)
             points = line if origin is None else origin.points_of(line, where=str(self._path))
             farthest_m = np.abs(points).max()
             if not farthest_m <= FARTHEST_M:  # `not <=` is also true of NaN
@@ -196,13 +211,13 @@ class ElementCollector:
         return MapFile(MapElements.from_polylines(lines, labels, scores), unused=self.unused)
 
     def describe(self) -> str:
-        """Describe the elements that are not used, the most frequent reasons first."""
+        """Describe the unused elements, the most frequent reasons first (`describe_unused`)."""
         return describe_unused(self.unused)
 
 
 def _area_m2(ring: FloatArray) -> float:
     """Area of a closed ring in square metres. (n, 2)"""
-    if len(ring) < 4:
+    if len(ring) < 4:  # fewer than three different vertices, which shapely refuses
         return 0.0
     area: float = shapely.Polygon(ring).area
     return area
@@ -215,7 +230,8 @@ def describe_unused(unused: Counter[str]) -> str:
         unused: Number of elements by the reason.
 
     Returns:
-        Numbers and reasons, the most frequent ones first.
+        Numbers and reasons, the most frequent ones first, such as
+        ``7 x without 'class', 2 x divider without length``. At most eight reasons are listed.
     """
     listed_reasons = unused.most_common(_LISTED_REASONS)
     parts = []
@@ -237,7 +253,7 @@ def finite_number(value: Any) -> float:
         raise InputError(f"{value!r:.40} is no number")
     try:
         number = float(value)
-    except OverflowError:
+    except OverflowError:  # an integer beyond the range of a float
         number = math.inf
     if not math.isfinite(number):
         raise InputError(f"{value!r:.40} is no finite number")

@@ -36,6 +36,7 @@ def chamfer_ap(
     matches = []
     for name, predicted, true in pairs:
         matches.append(evaluator.match(name, predicted, true))
+    # Figures by names such as ``chamfer/divider/AP``. ``num_gts`` is the number of true elements.
     metrics = flat_metrics(evaluator.reports(matches))
     ap_of_class = {}
     for name in classes:
@@ -65,6 +66,7 @@ def near_and_total_m(
         Length near the other map and total length, in metres. (2,)
     """
     measured = _linestrings(lines, label)
+    # The strip around a line has round ends, and each quarter of a circle has 32 segments.
     strips = shapely.buffer(_linestrings(other, label), within_m, quad_segs=32)
     near = shapely.intersection(measured, shapely.union_all(strips))
     return np.array([shapely.length(near).sum(), shapely.length(measured).sum()])
@@ -73,6 +75,7 @@ def near_and_total_m(
 def _linestrings(elements: MapElements, label: int) -> np.ndarray:
     """Convert the elements of one class to shapely geometries. (N,)"""
     polylines = elements.select(elements.labels == label).polylines
+    # Without elements, only an array of objects is accepted as an array of geometries.
     return np.array([shapely.linestrings(line) for line in polylines], dtype=object)
 
 
@@ -87,9 +90,9 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
     Returns:
         Elements inside the range, in the annotation frame.
     """
-    nearby = drive.nearby(frame, elements)
+    nearby = drive.nearby(frame, elements)  # a fast preselection by bounding boxes
     local = MapElements(
-        points=frame.to_frame(nearby.points),
+        points=frame.to_frame(nearby.points),  # from the global frame to the annotation frame
         offsets=nearby.offsets,
         labels=nearby.labels,
         scores=nearby.scores,
@@ -108,7 +111,8 @@ def map_figures(
         drives: Drives with equal classes. (D,)
 
     Returns:
-        Values in [0, 1] by figure, then by class or ``mean``. ``AP`` is the AP of whole elements.
+        Values in [0, 1] by figure, then by class or ``mean``; a class without a value is left out,
+        and a mean without classes is NaN. ``AP`` is the AP of whole elements.
         ``AP per sample`` is the AP of the maps cut to the range of each sample.
         ``completeness@T`` is the share of the true length within T metres of the predicted map.
         ``accuracy@T`` is the share of the predicted length within T metres of the true map. Both
@@ -130,6 +134,7 @@ def map_figures(
     for within_m in CHAMFER_THRESHOLDS:
         completeness = _near_shares(truths, others=maps, classes=classes, within_m=within_m)
         figures[f"completeness@{within_m}"] = completeness
+    # A second loop, because figures are printed in this order: first all values of completeness.
     for within_m in CHAMFER_THRESHOLDS:
         accuracy = _near_shares(maps, others=truths, classes=classes, within_m=within_m)
         figures[f"accuracy@{within_m}"] = accuracy
@@ -149,7 +154,7 @@ def _near_shares(
         for lines, other in zip(measured, others, strict=True):
             lengths_m.append(near_and_total_m(lines, other, label=label, within_m=within_m))
         near_m, total_m = np.sum(lengths_m, axis=0)
-        if total_m:
+        if total_m:  # a class without lines has no share
             share_of_class[name] = float(near_m / total_m)
     return _with_mean(share_of_class)
 
@@ -161,20 +166,23 @@ def figures_table(figures: Mapping[str, Mapping[str, Mapping[str, float]]]) -> s
         figures: Results of ``map_figures`` by the name of each map.
 
     Returns:
-        A table with a row per figure and map, and a column per class, in percent.
+        A table with a row per figure and map, and a column per class, in percent; ``-`` for a class
+        without a value.
     """
-    first_figures = next(iter(figures.values()))
+    first_figures = next(iter(figures.values()))  # all maps have equal names of figures
     # The columns are the classes of all figures, in the order in which they first occur.
     columns: list[str] = []
-    for values in first_figures.values():
-        for key in values:
+    for class_values in first_figures.values():
+        for key in class_values:
             if key != "mean" and key not in columns:
                 columns.append(key)
     columns.append("mean")
     rows = []
     for figure in first_figures:
         for name, figures_of_map in figures.items():
-            values = figures_of_map[figure]
-            cells = [f"{100 * values[key]:.1f}" if key in values else "-" for key in columns]
+            class_values = figures_of_map[figure]
+            cells = []
+            for key in columns:
+                cells.append(f"{100 * class_values[key]:.1f}" if key in class_values else "-")
             rows.append([figure, name, *cells])
     return markdown_table(["figure", "map", *columns], rows)

@@ -17,8 +17,9 @@ from gsmap.visualization.style import MapStyle
 def write_video(path: str | Path, replay: Replay, width_px: int = 1280) -> None:
     """Write a drive as a video in H.264 (``.mp4``) that plays in real time.
 
-    Each picture shows the cameras, the predictions of the frame from above and, unless the map of
-    the drive is empty, the map up to the frame.
+    There is one picture for each frame. It shows the cameras (if the replay has a data root), the
+    predictions of the frame from above and, unless the map of the drive is empty, the map up to the
+    frame.
 
     Args:
         path: File to write.
@@ -30,6 +31,8 @@ def write_video(path: str | Path, replay: Replay, width_px: int = 1280) -> None:
         RuntimeError: If ``av`` (PyAV) is missing.
     """
     times_ns = [frame.sample.timestamp_ns for frame in replay.drive.frames]
+    # A generator, so that only one picture is in memory. There is one moment for each frame, in the
+    # order of time, so the pictures and `times_ns` correspond.
     pictures = (_draw_moment(moment, replay, width_px=width_px) for moment in replay.moments())
     write_film(path, pictures, times_ns)
 
@@ -39,8 +42,9 @@ def _draw_moment(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
     frame = moment.frame
     sample = frame.sample
     drive = replay.drive
-    elements = frame.elements
-    # ``moment.lines`` are the lines of the frame's elements, in their order.
+    elements = frame.elements  # in the global frame
+    # ``moment.lines`` are the lines of these elements in the annotation frame, in equal order,
+    # raised to the ground.
     predictions = MapElements.from_polylines(
         moment.lines, labels=elements.labels, scores=elements.scores
     )
@@ -49,9 +53,9 @@ def _draw_moment(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
     if has_map:
         lines = []
         labels = []
-        for label, points in moment.map_lines:
-            global_xy = points[:, :2]
-            lines.append(frame.to_frame(global_xy))
+        for label, global_points in moment.map_lines:
+            # A view from above needs no heights. `to_frame` takes x and y to the annotation frame.
+            lines.append(frame.to_frame(global_points[:, :2]))
             labels.append(label)
         panels.append(BEVPanel("Map so far", MapElements.from_polylines(lines, labels)))
     cameras = []
@@ -61,9 +65,10 @@ def _draw_moment(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
         cameras,
         panels,
         grid=BEVGrid(x_range=drive.x_range, y_range=drive.y_range),
+        # Orientation of the annotation frame, with the ground plane from the sensor's mounting.
         view=replay.view.with_mounting(sample.ego_from_frame),
         style=MapStyle(classes=drive.classes),
-        camera_elements=predictions,
+        camera_elements=predictions,  # drawn over the images
         title=drive.name,
         width_px=width_px,
     )

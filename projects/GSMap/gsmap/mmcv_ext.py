@@ -5,6 +5,10 @@ imports every operator from that module. GSMap uses two operators, the hard voxe
 points and the modulated deformable convolution, which are implemented with torch. All other
 operators are functions that raise an error with the name of the operator and the command that
 installs it. ``gsmap/__init__.py`` adds `MmcvExtFinder` to ``sys.meta_path``.
+
+The functions have the names and the arguments of mmcv's compiled functions, and write to the output
+tensors that mmcv passes. They import GSMap's operators when they are called, because this module is
+loaded while mmcv is being imported.
 """
 
 from __future__ import annotations
@@ -35,8 +39,8 @@ class MmcvExtFinder:
 
         Args:
             name: Full name of the module.
-            path: Search path of the parent package. Not used.
-            target: Module to reload. Not used.
+            path: Search path of the parent package. Not used; the import system passes it.
+            target: Module to reload. Not used; the import system passes it.
 
         Returns:
             Specification of this file as a module, or None for all other names.
@@ -51,7 +55,7 @@ def get_compiling_cuda_version() -> str:
     return "not available"
 
 
-get_compiler_version = get_compiling_cuda_version
+get_compiler_version = get_compiling_cuda_version  # mmcv imports both names
 
 
 def hard_voxelize_forward(
@@ -65,6 +69,8 @@ def hard_voxelize_forward(
     **_: Any,
 ) -> None:
     """Group points by voxel and write the results to the output tensors of mmcv.
+
+    Further arguments of mmcv are ignored.
 
     Args:
         points: Points x, y, z in metres and further channels. (n, C)
@@ -93,6 +99,7 @@ def modulated_deform_conv_forward(*tensors: Tensor, **geometry: Any) -> None:
 
     Args:
         tensors: Images, weight, bias, ones, offset, mask, output and columns, in the order of mmcv.
+            Ones and columns are working memory of the compiled operator and are not used.
         geometry: Settings of the convolution under the names of mmcv.
     """
     images, weight, bias, _ones, offset, mask, output, _columns = tensors
@@ -105,7 +112,8 @@ def modulated_deform_conv_backward(*tensors: Tensor, **geometry: Any) -> None:
 
     Args:
         tensors: Images, weight, bias, ones, offset, mask and columns; then the gradients of images,
-            weight, bias, offset and mask, which are written; then the gradient of the output.
+            weight, bias, offset and mask, which are written; then the gradient of the output. Ones
+            and columns are not used.
         geometry: Settings of the convolution under the names of mmcv.
     """
     import torch
@@ -114,13 +122,14 @@ def modulated_deform_conv_backward(*tensors: Tensor, **geometry: Any) -> None:
     inputs = []
     for tensor in (images, weight, bias, offset, mask):
         inputs.append(tensor.detach().requires_grad_())
-    with torch.enable_grad():
+    with torch.enable_grad():  # gradients are off in a backward pass
         output = _deform_conv(inputs, geometry)
+    # An input without influence on the output, such as an unused bias, gets zeros.
     input_grads = torch.autograd.grad(
         output, inputs, grad_outputs=grad_output, materialize_grads=True
     )
-    for grad, values in zip(grads, input_grads, strict=True):
-        grad.copy_(values)
+    for grad, input_grad in zip(grads, input_grads, strict=True):
+        grad.copy_(input_grad)
 
 
 def _deform_conv(inputs: Sequence[Tensor], geometry: dict[str, Any]) -> Tensor:
@@ -143,6 +152,8 @@ def _deform_conv(inputs: Sequence[Tensor], geometry: dict[str, Any]) -> Tensor:
 
 
 def __getattr__(name: str) -> Callable[..., NoReturn]:
+    """Return a function that raises RuntimeError for an operator that this module lacks."""
+    # The import system looks up optional attributes, such as `__path__`.
     if name.startswith("__"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

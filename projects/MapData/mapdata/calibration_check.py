@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from gsmap.datasets.annotations.record import RANGES, CameraRecord, MapSample
 from gsmap.datasets.image_files import image_size
-from gsmap.datasets.plausibility import calibration_warnings as calibration_warnings  # public here
+from gsmap.datasets.plausibility import calibration_warnings as calibration_warnings  # re-exported
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import frame_view
@@ -41,6 +41,7 @@ def image_warnings(sample: MapSample, data_root: Path) -> list[str]:
     for camera in sample.cameras:
         path = data_root / camera.path
         if path.is_file():
+            # The second argument is the beginning of error messages.
             width, height = image_size(path, f"camera {camera.name!r}")
             if (width, height) != (camera.width, camera.height):
                 warnings.append(
@@ -58,22 +59,27 @@ def calibration_figure(
     Args:
         sample: The sample.
         frame: Annotation frame of the sample, ``lidar`` or ``ego``.
-        data_root: Folder that image paths are relative to. A missing image is drawn in grey.
-        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
+        data_root: Folder that image paths are relative to. A missing or damaged image is drawn in
+            grey.
+        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``; None for
+            the usual height.
 
     Returns:
         The figure, with different colours for lines ahead, to the left, to the right and behind.
     """
+    # The origin of the ground frame is on the road below the rear axle (x ahead, y left, z up).
     frame_from_ground = invert_rigid(ground_from_frame(sample, frame, ground_z_m=ground_z_m))
     lines = _ground_lines(frame_from_ground)
-    wedges = []
+    wedges = []  # fields of view, which are drawn only in the panel from above
     for camera in sample.cameras:
         wedges.append(("cameras", _field_of_view(camera, frame_from_ground)))
     x_range, y_range = RANGES[frame]
     return compose_figure(
+        # With `grey`, a missing or damaged image is drawn in grey.
         cameras=camera_views(sample.cameras, data_root, token=sample.token, grey=True),
         panels=[BEVPanel("From above", _elements([*lines, *wedges]))],
         grid=BEVGrid(x_range=x_range, y_range=y_range),
+        # The view has the ground plane; it follows from the mounting of the sensor, if it is known.
         view=frame_view(frame, ground_z_m=ground_z_m).with_mounting(sample.ego_from_frame),
         style=MapStyle(classes=_LINE_CLASSES),
         camera_elements=_elements(lines),
@@ -96,7 +102,7 @@ def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]
     """Lines on the road: pairs of a class and two points (2, 3), in metres in the frame."""
     reach = _REACH_M
     side = _SIDE_REACH_M
-    ends = []
+    ends = []  # class, start (x, y) and end (x, y) of each line in the ground frame, in metres
     # Without 0, where the lines ahead, behind, left and right are drawn instead.
     offsets = [offset for offset in np.arange(-reach, reach + 1, 5.0) if offset != 0]
     for x in offsets:
@@ -111,7 +117,7 @@ def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]
     lines = []
     for name, (start_x, start_y), (end_x, end_y) in ends:
         points = np.array([[start_x, start_y, 0, 1], [end_x, end_y, 0, 1]])
-        points_in_frame = points @ frame_from_ground.T  # (2, 4)
+        points_in_frame = points @ frame_from_ground.T  # homogeneous row vectors (2, 4)
         lines.append((name, points_in_frame[:, :3]))
     return lines
 
@@ -125,7 +131,7 @@ def _field_of_view(camera: CameraRecord, frame_from_ground: np.ndarray) -> np.nd
     tips = []
     for u in (0, camera.width):  # left and right edge, in the row of the optical axis
         slope = (u - intrinsics[0, 2]) / intrinsics[0, 0]
-        ray = rotation @ [slope, 0, 1]
+        ray = rotation @ [slope, 0, 1]  # from camera axes (right, down, forward)
         tips.append(centre + _WEDGE_M * ray / np.linalg.norm(ray))
     outline = np.array([centre, *tips, centre])
     outline[:, 2] = 0  # down to the road

@@ -32,16 +32,19 @@ from mapdata.local_map import POLYGON, vertices_of
 from mapdata.paths import path_below
 
 _LOGGER = logging.getLogger(__name__)
+# Placeholders: token of the record, and height of the sensor above the road in metres.
 _UNMOUNTED = (
     "record %r has no ego_from_frame: pictures will take the road to be level, %.2f m below the "
     "sensor (ground_z_m; nuScenes' height by default), and models that lift images (LSS) "
     "cannot use it."
 )
+# Placeholder: path of the annotation file.
 _UNKNOWN_ROAD = (
     "%s does not contain the height of the road in the frame 'ego': pictures and inference will "
     "take the road to be 0.31 m below the origin (Argoverse 2's axle); set the height with "
     "AnnotationMeta(ground_z_m=...)."
 )
+# Placeholders: number of records without elements after clipping, number of records, first token.
 _ALL_ELEMENTS_LOST = (
     "%d of %d records lose all of their elements (the first is %r), as none lies in x_range and "
     "y_range: points must be in metres of the frame, not of the world, and not in millimetres."
@@ -118,6 +121,7 @@ def from_records(
         records = calibrated_records(
             list(records), Path(calibration), meta=meta, root=Path(data_root)
         )
+    # A generator: samples are checked and written one by one.
     samples = create_samples(records, meta, root=Path(data_root), join=join)
     return write_annotations(path, meta, samples, shard=shard, source=source)
 
@@ -147,7 +151,7 @@ def create_samples(
             if unknown:
                 raise InputError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
             sample = _create_sample(record, meta=meta, root=root)
-            check_samples([sample], meta)
+            check_samples([sample], meta)  # raises an error for a wrong shape or value
             count += 1
             had_elements = bool(sample.instances)
             if sample.instances is not None:
@@ -203,6 +207,7 @@ def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
         lines = lines_of[label]
         _snap_ends(lines)
         parts = shapely.get_parts(shapely.line_merge(shapely.MultiLineString(lines)))
+        # `vertices_of` returns the vertices of each joined line.
         for points in vertices_of(parts, dim=lines[0].shape[1]):
             joined.append(MapInstance(label=label, points=points))
     return joined
@@ -304,7 +309,7 @@ def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraR
         where = f"sample {token!r}, camera {camera['name']!r}"
         path = path_below(root, name=camera["path"], noun=f"{where}: the path")
         values["width"], values["height"] = image_size(path, where)
-    if np.any(camera.get("distortion", ())):
+    if np.any(camera.get("distortion", ())):  # coefficients that are all zero have no effect
         values["path"] = _rectify_image(values, root=root)
     return _create_record(CameraRecord, values)
 
@@ -324,6 +329,7 @@ def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
         rig_camera.distortion.tolist(),
         rig_camera.model,
     )
+    # The digest in the folder name keeps images that were rectified with another calibration apart.
     digest = hashlib.sha256(repr(calibration).encode()).hexdigest()[:12]
     folder = f"rectified/{file_name(rig_camera.name)}-{digest}"
     path = f"{folder}/{file_name(camera['path'])}.jpg"
@@ -360,5 +366,6 @@ def _clip(points: Points, meta: AnnotationMeta) -> list[Points]:
         )
     box = shapely.box(xmin=low[0], ymin=low[1], xmax=high[0], ymax=high[1])
     parts = shapely.get_parts(shapely.intersection(polygon, box))
+    # The ring may touch the box in points or lines, which are left out. The cut adds no holes.
     is_area = (shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)
     return vertices_of(shapely.get_exterior_ring(parts[is_area]), dim=meta.dim)

@@ -17,7 +17,9 @@ from gsmap.utils.extras import import_extra
 # A bag of n compressed bytes may have at most FREE_BYTES + TIMES * n bytes after decompression.
 FREE_BYTES = 1 << 26
 TIMES = 100
-_DECOMPRESSING = {  # modules whose decompression is replaced, by the module that is imported
+# Modules whose decompression is replaced, by the name of the module that is imported. MCAP is a
+# file format of ROS 2 and of other systems.
+_DECOMPRESSING = {
     "rosbags.rosbag1": ("rosbags.rosbag1.reader",),
     "rosbags.rosbag2": ("rosbags.rosbag2.reader", "rosbags.rosbag2.storage_mcap"),
     "mcap.reader": ("mcap.stream_reader",),
@@ -26,7 +28,11 @@ _DECOMPRESSING = {  # modules whose decompression is replaced, by the module tha
 
 
 class _Bag:
-    """Number of compressed (packed) and decompressed (unpacked) bytes of the current bag."""
+    """Number of compressed (packed) and decompressed (unpacked) bytes of the current bag.
+
+    They are class attributes, because the libraries pass no bag to a decompression function. One
+    bag is read at a time.
+    """
 
     packed: ClassVar[int] = 0
     unpacked: ClassVar[int] = 0
@@ -42,7 +48,7 @@ def import_bounded(name: str) -> ModuleType:
     """Import a module that reads bags, with bounded decompression.
 
     Args:
-        name: Name of a module of the extra ``bags``.
+        name: Name of a module of the extra ``bags``, a key of ``_DECOMPRESSING``.
 
     Returns:
         The module.
@@ -60,6 +66,8 @@ def _bound(module: Any) -> None:
     if hasattr(module, "_is_bounded"):
         return
     module._is_bounded = True
+    # Tables of functions by compression: `decompressors` for ROS 1, `DECOMPRESSORS` for MCAP files
+    # of ROS 2. Their replacements take the original `module.zstd`, which is replaced afterwards.
     for table_name in ("decompressors", "DECOMPRESSORS"):
         table: dict[str, Any] = getattr(module, table_name, {})
         if "bz2" in table:
@@ -68,6 +76,7 @@ def _bound(module: Any) -> None:
             table["zstd"] = _bounded_stream(module.zstd.open)
         if "lz4" in table:
             table["lz4"] = _bounded_lz4(table["lz4"])
+    # Modules that the readers call directly. The replacements have only the functions for reading.
     zstd = getattr(module, "zstd", None)
     if zstd is not None:
         module.zstd = SimpleNamespace(
@@ -89,6 +98,10 @@ def _remaining_bytes() -> int:
 def _count_unpacked(content: bytes, limit: int) -> bytes:
     """Count decompressed bytes, and return them.
 
+    Args:
+        content: The decompressed bytes.
+        limit: `_remaining_bytes` before these bytes are counted.
+
     Raises:
         ValueError: If there are more than ``limit`` bytes.
     """
@@ -102,7 +115,10 @@ def _count_unpacked(content: bytes, limit: int) -> bytes:
 
 
 def _bounded_stream(open_stream: Callable[[BytesIO], Any]) -> Callable[..., bytes]:
-    """Function that decompresses bytes as a stream, at most up to the limit."""
+    """Function that decompresses bytes as a stream, at most up to the limit.
+
+    Some libraries also pass the decompressed size. It is ignored: a file may contain any size.
+    """
 
     def decompress(data: bytes, *_: object) -> bytes:
         _Bag.packed += len(data)
@@ -129,7 +145,10 @@ def _bounded_lz4(unbounded: Callable[..., bytes]) -> Callable[..., bytes]:
 
 
 def _bounded_file(zstd: Any) -> Callable[..., Any]:
-    """Function that opens a compressed file, and counts the bytes of each read."""
+    """Function that opens a compressed file, and counts the bytes of each read.
+
+    The reader copies the file in blocks, so one read is too small to fill the memory.
+    """
 
     def open_file(file: Any, mode: str) -> Any:
         _Bag.packed += os.fstat(file.fileno()).st_size

@@ -7,7 +7,7 @@ from minicity.curves import Array
 from minicity.texture import GroundTexture
 from minicity.vehicles import Vehicle
 
-BEAMS = 32
+BEAMS = 32  # one for each elevation
 COLUMNS = 720  # azimuth angles of a revolution
 LOWEST_RAD = np.deg2rad(-30.0)  # elevation of the lowest beam
 HIGHEST_RAD = np.deg2rad(9.0)
@@ -36,6 +36,7 @@ def vehicle_footprints(vehicles: list[Vehicle]) -> Array:
     """Footprints of vehicles and people: four corners x, y and the height, in metres. (n, 9)"""
     if not vehicles:
         return np.zeros((0, 9))
+    # Half the length ahead, and half the width to the left. (n, 2) each
     yaw = np.array([v.yaw_rad for v in vehicles])
     size = np.array([v.size for v in vehicles])
     middle = np.array([v.center for v in vehicles])[:, :2]
@@ -69,6 +70,7 @@ def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:
     dx = directions[:, 0, None, None]
     dy = directions[:, 1, None, None]
     direction_cross_edge = dx * edge[None, ..., 1] - dy * edge[None, ..., 0]
+    # A ray parallel to an edge would divide by zero. With a tiny divisor it misses the edge.
     is_parallel = np.abs(direction_cross_edge) < 1e-12
     direction_cross_edge = np.where(is_parallel, 1e-12, direction_cross_edge)
     # A ray meets the line of an edge where reach * direction = start + share * edge. The cross
@@ -100,6 +102,7 @@ def scan(
         x, y, z in the sensor frame in metres, intensity in [0, 255], beam index. (N, 5)
     """
     origin = world_from_lidar[:3, 3]
+    # A random start of the revolution, less than one step of the azimuth.
     first_rad = rng.uniform(low=0, high=2 * np.pi / COLUMNS)
     azimuth = np.linspace(-np.pi, np.pi, num=COLUMNS, endpoint=False) + first_rad
     elevation = np.linspace(LOWEST_RAD, HIGHEST_RAD, num=BEAMS)
@@ -112,6 +115,7 @@ def scan(
     reach = np.broadcast_to(ground[:, None], (BEAMS, COLUMNS)).copy()
     hit_box = np.full((BEAMS, COLUMNS), -1)
     corner_distances = np.linalg.norm(boxes[:, :8].reshape(-1, 4, 2) - origin[:2], axis=-1)
+    # Boxes without a corner in range are left out.
     near = boxes[corner_distances.min(axis=1) < RANGE_M]
     entry = _entry_distances(origin[:2], directions, boxes=near)  # (COLUMNS, boxes)
     column, box = np.nonzero(np.isfinite(entry))
@@ -126,6 +130,7 @@ def scan(
     rows, hit = np.nonzero((height > 0) & (height < near[box, 8]))
     reach[rows, column[hit]] = distance[hit]
     hit_box[rows, column[hit]] = box[hit]
+    # Distances along the rays must be in range. `rows` are the beams of the points.
     rows, columns = np.nonzero(reach / np.cos(elevation)[:, None] < RANGE_M)
     noise = rng.normal(loc=0, scale=RANGE_NOISE_M, size=len(rows))
     distance = reach[rows, columns] + noise

@@ -1,4 +1,10 @@
-"""Layout of the surfaces, kerbs and paint of a town, as input of the renderer."""
+"""Layout of the surfaces, kerbs and paint of a town, as input of the renderer.
+
+Arc lengths run along the centre line of a road. Offsets from it are positive to the left, so
+forward lanes have negative offsets. ``road.section`` has the offsets of the built road. The edges
+in ``road.forward_edges`` and ``road.backward_edges``, from the centre to the kerb, also include the
+shift of the painted lines (``road.shift_m``).
+"""
 
 from itertools import pairwise
 
@@ -18,7 +24,7 @@ from minicity.scene_map import (
 )
 from minicity.town import Carpark, Town, road_surface
 
-ASPHALT_GREY = 82  # grey level of asphalt of tone 1
+ASPHALT_GREY = 82  # grey level of asphalt of tone 1; a tone is a factor of the brightness
 EDGE_LINE_M = 0.12  # width of edge lines and of the lines between parking bays
 
 
@@ -45,6 +51,7 @@ def make_scene_map(town: Town, bounds: tuple[float, float, float, float]) -> Sce
     for junction in town.junctions:
         outline = Polygon(junction.outline)
         if outline.intersects(window):
+            # `arms` are pairs: index of a road, and whether it starts here.
             grey = np.mean([town.roads[r].style.asphalt for r, _ in junction.arms])
             tone = float(grey / ASPHALT_GREY)
             scene.surfaces.append(Surface(outline, "asphalt", tone=tone))
@@ -76,6 +83,7 @@ def _add_road(scene: SceneMap, road: Road) -> None:
     if section.median_m > 0:
         ring = road.band(section.forward_edges[0], section.backward_edges[0])
         scene.surfaces.append(Surface(Polygon(ring), "median"))
+        # The outline does not repeat its first point, but the kerb is a closed line.
         scene.kerbs.append(np.concatenate([ring, ring[:1]]))
     scene.markings += road_markings(road)
 
@@ -104,14 +112,14 @@ def lane_divider_offsets(road: Road) -> list[float]:
 def divider_offsets(road: Road) -> list[float]:
     """Offsets in metres of all lines of divider paint, the centre line first."""
     # The centre line has the offset 0, to which the shift of painted lines is added.
-    center = [road.shift_m] if road.has_center_line else []
-    return [*center, *lane_divider_offsets(road)]
+    center_offsets = [road.shift_m] if road.has_center_line else []
+    return [*center_offsets, *lane_divider_offsets(road)]
 
 
 def road_markings(road: Road) -> list[Marking]:
     """Paint of a road: the white markings, then the yellow ones if there are any."""
     style = road.style
-    dash_m, gap_m = style.dash_m
+    dash_m, gap_m = style.dash_m  # painted and bare length of a dashed line
     white: list[Array] = []
     yellow: list[Array] = []
     for start, end in divider_pieces(road):
@@ -137,7 +145,10 @@ def road_markings(road: Road) -> list[Marking]:
 
 
 def _center_paint(center: Array, road: Road) -> list[Array]:
-    """Painted areas of a centre line (n, 2) in the style of a road. Each (m, 2)"""
+    """Painted areas of a centre line (n, 2) in the style of a road. Each (m, 2)
+
+    The styles are ``double_yellow``, ``dashed_white``, and ``yellow`` or ``white`` (solid lines).
+    """
     style = road.style
     if style.divider == "double_yellow":
         return double_line(center, style.line_m * 0.8, gap_m=0.12)
@@ -161,9 +172,14 @@ def _edge_lines(road: Road, start: float, end: float) -> list[Array]:
 
 
 def _crossing_paint(road: Road, start: float, end: float) -> list[Array]:
-    """Painted areas of a crossing between two arc lengths. Each (n, 2)"""
+    """Painted areas of a crossing between two arc lengths. Each (n, 2)
+
+    The paint is a row of stripes (``zebra``), or a line along each side (``ladder``).
+    """
     outlines = []
+    # Offsets of the right and the left edge of each surface: two surfaces beside a median.
     for right, left in road.carriageways():
+        # The paint ends 0.15 m before these edges.
         offsets = np.linspace(right + 0.15, left - 0.15, num=6).tolist()
         near_side = np.stack([road.point(start, offset) for offset in offsets])
         far_side = np.stack([road.point(end, offset) for offset in offsets])
@@ -176,7 +192,10 @@ def _crossing_paint(road: Road, start: float, end: float) -> list[Array]:
 
 
 def _stop_paint(road: Road) -> list[Array]:
-    """Painted areas of the stop lines of a road. Each (n, 2)"""
+    """Painted areas of the stop lines of a road. Each (n, 2)
+
+    A stop line covers the lanes of its direction up to 0.1 m from the centre.
+    """
     outlines = []
     if road.stop_forward:
         start, end = road.stop_forward
@@ -210,8 +229,9 @@ def _arrows(road: Road) -> list[Array]:
         has_several_lanes = len(edges) > 2  # n lanes have n + 1 edges
         if stop is None or not has_several_lanes or road.length_m < 40:
             continue
+        # Vehicles reach the start of a forward stop line first, and the end of a backward one.
         arc_m = stop[0] - 7.0 if sign > 0 else stop[1] + 7.0
-        forward = unit(road.direction(arc_m)) * sign
+        forward = unit(road.direction(arc_m)) * sign  # unit vector in the direction of travel
         side = np.array([-forward[1], forward[0]])
         for inner, outer in pairwise(edges):
             base = road.point(arc_m, 0.5 * (inner + outer))

@@ -16,11 +16,13 @@ from minicity.roads import CROSSING_GAP_M, STOP_LINE_M, Lane, Road
 LaneKey = tuple[int, bool, int]
 """Key of a lane within its town: index of the road, direction, and index of the lane."""
 MAX_SIDE = 8  # largest number of grid nodes along an edge of a town
-LARGEST_HOUSE_M = 22.0  # houses cannot touch if their centres are farther apart in x or y
+# Houses cannot touch if their centres are farther apart than this in x or y. The largest house is
+# 16 x 12 m, with a diagonal of 20 m.
+LARGEST_HOUSE_M = 22.0
 END_STOP_M = 0.6  # distance of a stop line without a crossing from the end of its road
 BAY_WIDTH_M = 2.6
 BAY_LENGTH_M = 5.0
-CARPARK_DEPTH_M = 15.0
+CARPARK_DEPTH_M = 15.0  # extent of a car park away from its road
 # Colours of the walls, BGR.
 WALLS = [
     (150, 165, 190),
@@ -39,8 +41,8 @@ class Carpark:
     Attributes:
         outline: Outline of the surface. (n, 2)
         driveway: Outline of the strip from the road across the pavement. (4, 2)
-        bays: Lines between the bays. Each (2, 2)
-        slots: Centre x, y and heading in radians of each bay. (n, 3)
+        bays: Lines beside the bays, one more than there are bays. Each (2, 2)
+        slots: x, y and heading in radians of the place for a vehicle in each bay. (n, 3)
     """
 
     outline: Array
@@ -98,7 +100,10 @@ class Town:
 
 
 def town_side(num_scenes: int) -> int:
-    """Number of grid nodes along the edge of a town, for scenes that rarely share a street."""
+    """Number of grid nodes along the edge of a town, for scenes that rarely share a street.
+
+    The town has about 1.3 nodes per scene, but at least 3 and at most ``MAX_SIDE`` along its edge.
+    """
     return int(np.clip(np.ceil(np.sqrt(1.3 * num_scenes)), 3, MAX_SIDE))
 
 
@@ -116,6 +121,8 @@ def make_town(name: str, seed: int, num_scenes: int) -> Town:
     if num_scenes == 0:
         return Town(name, 2 * MARGIN_M, roads=[], junctions=[], lanes={}, connectors={})
     side = town_side(num_scenes)
+    # Streets (`chains`) join the grid nodes. A road is a street without its parts in junctions.
+    # Each step has a separate random generator, so a change of one does not affect the others.
     nodes = make_nodes(side, seed, name=name)
     chains = make_chains(nodes, seed, name=name)
     roads, meetings = make_roads(nodes, chains, seed=seed, name=name)
@@ -123,7 +130,7 @@ def make_town(name: str, seed: int, num_scenes: int) -> Town:
         _add_crossings(road, make_rng(seed, name, "crossings", road.index))
     junctions = []
     for node, meeting in enumerate(meetings):  # the roads that meet at each node
-        if len(meeting) >= 3:
+        if len(meeting) >= 3:  # fewer roads make no junction
             arms = [(road_index, at_start) for road_index, at_start, _ in meeting]
             junctions.append(make_junction(node, arms, roads=roads))
     lanes, connectors = connect_lanes(roads, junctions)
@@ -154,7 +161,7 @@ def connect_lanes(
     lanes_by_road = {road.index: road.lanes() for road in roads}
     connectors: dict[LaneKey, list[Connector]] = {}
     for junction in junctions:
-        for connector in make_connectors(junction, lanes_by_road):
+        for connector in make_connectors(junction, lanes_by_road):  # all permitted turns
             connectors.setdefault(connector.source.key, []).append(connector)
     lanes = {}
     for road_lanes in lanes_by_road.values():
@@ -175,6 +182,7 @@ def _add_crossings(road: Road, rng: np.random.Generator) -> None:
             gap_m = CROSSING_GAP_M + float(rng.choice([0.0, 2.0]))
             depth_m = float(rng.uniform(low=2.5, high=4.5))
             stop = lanes_in > 0 and rng.random() < 0.8
+            # The crossing begins `gap_m` from this end. The paint of dividers ends before it.
             road.add_crossing(gap_m, depth_m, at_start=at_start, stop=stop)
         elif lanes_in and rng.random() < 0.6:  # only a stop line, at which painted dividers end
             if at_start:
@@ -183,7 +191,7 @@ def _add_crossings(road: Road, rng: np.random.Generator) -> None:
             else:
                 road.stop_forward = (length - END_STOP_M - STOP_LINE_M, length - END_STOP_M)
                 road.clear_end_m = length - END_STOP_M - STOP_LINE_M
-    if length > 70 and rng.random() < 0.25:
+    if length > 70 and rng.random() < 0.25:  # a crossing of 3.2 m near the middle of the road
         middle = float(rng.uniform(low=0.4, high=0.6)) * length
         road.crossings.append((middle - 1.6, middle + 1.6))
 
@@ -195,9 +203,9 @@ def road_surface(road: Road) -> list[Polygon]:
 
 def _add_surroundings(town: Town, rng: np.random.Generator) -> None:
     """Add car parks, pavements, houses, trees and lamp posts to a town, in place."""
-    surfaces = []
+    surfaces = []  # for vehicles
     medians = []
-    pavements = []
+    pavements = []  # outlines of roads and junctions together with their pavements
     for road in town.roads:
         section = road.section
         surfaces += road_surface(road)
@@ -213,19 +221,21 @@ def _add_surroundings(town: Town, rng: np.random.Generator) -> None:
         outline = Polygon(junction.outline)
         surfaces.append(outline)
         pavements.append(outline.buffer(2.5))
-    streets = shapely.union_all(surfaces)
+    streets = shapely.union_all(surfaces)  # roads and junctions, without car parks
     # The outline of a road in a sharp bend may cross itself, which `buffer(0)` repairs.
     blocked = shapely.union_all([p.buffer(0) for p in [*pavements, *medians, *surfaces]])
     _add_carparks(town, blocked, rng=rng)
     parks = [Polygon(p.outline).union(Polygon(p.driveway)) for p in town.carparks]
     town.drivable = shapely.union_all([streets, *parks])
-    around = shapely.union_all([p.buffer(0) for p in pavements])
-    raised = shapely.union_all(medians)
-    pieces = shapely.get_parts(around.difference(town.drivable).difference(raised))
+    # Pavements are the parts of these outlines that are neither for vehicles nor medians. Slivers
+    # are left out.
+    outlines = shapely.union_all([p.buffer(0) for p in pavements])
+    all_medians = shapely.union_all(medians)
+    pieces = shapely.get_parts(outlines.difference(town.drivable).difference(all_medians))
     town.walkways = [p for p in pieces if p.geom_type == "Polygon" and p.area > 0.5]
     park_margins = [p.buffer(1.0) for p in parks]
-    built_up = shapely.union_all([blocked.buffer(0.6), *park_margins])
-    _add_buildings(town, blocked=built_up, rng=rng)
+    without_houses = shapely.union_all([blocked.buffer(0.6), *park_margins])
+    _add_buildings(town, blocked=without_houses, rng=rng)
     _add_furniture(town, rng)
 
 
@@ -255,11 +265,13 @@ def _make_carpark(road: Road, sign: int, middle_m: float, bays: int) -> Carpark:
         bays: Number of bays.
     """
     kerb = road.section.left_m if sign > 0 else road.section.right_m
+    # Distance of the near edge of the car park from the centre line of the road, in metres.
     near = abs(kerb) + road.style.walkway_m + 0.5
     length = bays * BAY_WIDTH_M
     yaw = road.direction(middle_m)
     center = road.point(middle_m, sign * (near + CARPARK_DEPTH_M / 2))
     outline = rectangle(center, yaw, length_m=length, width_m=CARPARK_DEPTH_M)
+    # The driveway overlaps the road by 0.3 m and the car park by 0.5 m, so that no gap is left.
     inner = road.point(middle_m, sign * (abs(kerb) - 0.3))
     mouth = road.point(middle_m, sign * (near + 0.5))
     driveway = rectangle(
@@ -268,16 +280,16 @@ def _make_carpark(road: Road, sign: int, middle_m: float, bays: int) -> Carpark:
         length_m=5.0,
         width_m=float(np.linalg.norm(mouth - inner)),
     )
-    # Corners of `rectangle`: front left, back left, back right, front right. `across` is the unit
-    # vector away from the road.
+    # Corners of `rectangle`: front left, back left, back right, front right. `along` is the unit
+    # vector along the road, and `across` the unit vector away from the road.
     along = outline[0] - outline[1]
     along = along / np.linalg.norm(along)
     across = sign * (outline[0] - outline[3]) / CARPARK_DEPTH_M
     heading = float(np.arctan2(across[1], across[0]))
-    far = center + across * (CARPARK_DEPTH_M / 2 - 0.3)
+    far = center + across * (CARPARK_DEPTH_M / 2 - 0.3)  # middle of the far ends of the bays
     lines = []
     slots = []
-    for k in range(bays + 1):
+    for k in range(bays + 1):  # n bays have n + 1 lines
         end = far + along * (k * BAY_WIDTH_M - length / 2)
         lines.append(np.stack([end, end - BAY_LENGTH_M * across]))
         if k < bays:
@@ -289,18 +301,19 @@ def _make_carpark(road: Road, sign: int, middle_m: float, bays: int) -> Carpark:
 
 def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> None:
     """Add houses along both sides of every road, clear of surfaces and of one another, in place."""
-    shapely.prepare(blocked)
+    shapely.prepare(blocked)  # speeds up the many tests of intersection below
     centers = np.zeros((0, 2))  # centres of the houses that have been added
     for road in town.roads:
-        dense = rng.random() < 0.75
+        dense = rng.random() < 0.75  # houses close to the pavement and to one another
         # `sign` is the side of the road, 1 for left and -1 for right. `kerb` is the distance of its
         # kerb from the centre line.
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
             arc_m = float(rng.uniform(low=0, high=10))
             while arc_m < road.length_m - 5:
                 front = float(rng.uniform(low=8, high=16))
-                depth = 3.0 if dense else 9.0
-                setback = road.style.walkway_m + float(rng.uniform(low=1.0, high=depth))
+                # The setback is the distance of the front from the kerb.
+                max_garden_m = 3.0 if dense else 9.0
+                setback = road.style.walkway_m + float(rng.uniform(low=1.0, high=max_garden_m))
                 house = _random_building(
                     road=road,
                     at_m=min(arc_m + front / 2, road.length_m - 0.1),
@@ -355,9 +368,10 @@ def _add_furniture(town: Town, rng: np.random.Generator) -> None:
     poles = []
     houses = [Polygon(b.footprint).buffer(1.2) for b in town.buildings]
     keep_clear = shapely.union_all([*houses, town.drivable.buffer(0.5)])
-    shapely.prepare(keep_clear)
+    shapely.prepare(keep_clear)  # speeds up the many tests below
     for road in town.roads:
-        tree_share = rng.random()
+        tree_share = rng.random()  # share of the places for trees along this road that have one
+        # As for houses: the side of the road, and the distance of its kerb from the centre line.
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
             first_tree = rng.uniform(low=3, high=12)
             for arc_m in np.arange(first_tree, road.length_m - 3, 11.0):
@@ -372,5 +386,6 @@ def _add_furniture(town: Town, rng: np.random.Generator) -> None:
                 x, y = road.point(float(arc_m), sign * (kerb + 0.65))
                 if not keep_clear.contains(shapely.Point(x, y)):
                     poles.append([x, y, rng.uniform(low=5.0, high=8.0)])
+    # `reshape` gives the arrays the right shape if there is none.
     town.trees = np.array(trees).reshape(-1, 3)
     town.poles = np.array(poles).reshape(-1, 3)

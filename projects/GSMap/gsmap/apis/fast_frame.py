@@ -2,7 +2,8 @@
 
 The prediction of a frame consists of hundreds of small operations, and the GPU waits for the host
 to launch each of them. If no tensor size depends on the values of tensors, all launches of a frame
-can be recorded once per image size as a CUDA graph, and replayed for later frames.
+can be recorded once per image size as a CUDA graph, and replayed for later frames. A recording
+always reads and writes fixed tensors: inputs are copied to them, and results are copied from them.
 """
 
 import threading
@@ -45,7 +46,7 @@ def reason_against(model: Any) -> str:
         return "it remembers earlier frames (temporal)"
     if model.prior is not None:
         return "it reads a map of earlier frames (prior)"
-    if head.not_exported:
+    if head.not_exported:  # the reason why the head has no ONNX export; empty if it has one
         return f"{type(head).__name__} has no fixed number of operations ({head.not_exported})"
     if not hasattr(model.data_preprocessor, "normalise"):
         return "its data_preprocessor is not MapDataPreprocessor"
@@ -61,7 +62,8 @@ class StaticFrame(nn.Module):
 
     Attributes:
         names: Names of the calibration arrays that the BEV encoder reads.
-        layout: Shape and type of each field of an element, by name; empty before the first call.
+        layout: Shape and type of each field of an element, by name. It is empty before the first
+            call, which sets it.
 
     Raises:
         ValueError: If the model cannot be computed with fixed sizes (`reason_against`).
@@ -74,9 +76,9 @@ class StaticFrame(nn.Module):
         self.model = model
         self.names: tuple[str, ...] = model.bev_encoder.calibration
         self.layout: dict[str, tuple[torch.Size, torch.dtype]] = {}
-        for part in model.bev_encoder.modules():
-            if hasattr(part, "fixed_sizes"):
-                part.fixed_sizes = True
+        for module in model.bev_encoder.modules():
+            if hasattr(module, "fixed_sizes"):
+                module.fixed_sizes = True
 
     def forward(self, images: Tensor, *calibration: Tensor) -> Tensor:
         """Predict the best elements of each sample, including elements outside of the map.
@@ -91,14 +93,14 @@ class StaticFrame(nn.Module):
             ``layout``, float32. (B, M, F)
         """
         model = self.model
-        images = model.data_preprocessor.normalise(images)
+        images = model.data_preprocessor.normalise(images)  # also pads the images
         feats = model.extract_img_feats(images)
         outputs = model.bev_encoder.encode(
-            model.bev_encoder.levels(feats),
+            model.bev_encoder.levels(feats),  # the levels that this encoder reads
             calibration=dict(zip(self.names, calibration, strict=True)),
             img_shape=(images.shape[-2], images.shape[-1]),
         )
-        last_layer = model.map_head(outputs)[-1]
+        last_layer = model.map_head(outputs)[-1]  # the head predicts after every decoder layer
         samples = []
         for scores, references in zip(last_layer.scores, last_layer.references, strict=True):
             samples.append(self._decode_elements(scores, references=references))
@@ -116,8 +118,11 @@ class StaticFrame(nn.Module):
             (M, F)
         """
         head = self.model.map_head
-        decoded = head.reference.decode(references)
+        decoded = head.reference.decode(references)  # fields by name, with points in metres
+        # Some coders change the logits by the decoded geometry before the selection.
         weighted_scores = head.coder.weigh_scores(scores, decoded)
+        # `best` selects a fixed number of elements. Elements outside of the map are removed only
+        # after the recorded operations (`_with_predictions`), because their number varies.
         best = head.coder.best(weighted_scores)
         fields = {"scores_3d": best.scores, "labels_3d": best.labels}
         fields |= head.select_detections(decoded, best)
@@ -125,6 +130,7 @@ class StaticFrame(nn.Module):
         columns = []
         for name, value in fields.items():
             layout[name] = (value.shape[1:], value.dtype)
+            # The added axis gives a field of one number per element a column, too.
             columns.append(value.unsqueeze(-1).flatten(1).float())  # (M, entries of the field)
         self.layout = layout
         return torch.cat(columns, dim=1)
@@ -155,7 +161,8 @@ class _Recording:
         graph: The CUDA graph.
         inputs: Tensors that the graph reads.
         output: Tensor that the graph writes.
-        versions: Versions of the model's weights at the time of the recording.
+        versions: Address and version of each weight and buffer of the model at the time of the
+            recording (`tensor_versions`). A change in place raises the version.
     """
 
     graph: Any
@@ -180,6 +187,7 @@ class FastFrames:
     frame: StaticFrame
     device: torch.device
     capture: bool = True
+    # Recordings by the shapes and types of the inputs; the least recently used one is first.
     _graphs: "OrderedDict[Any, _Recording]" = field(default_factory=OrderedDict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -199,7 +207,7 @@ class FastFrames:
             The samples with ``pred_instances_3d``, on the CPU.
 
         Raises:
-            RuntimeError: If a frame of this size cannot be recorded.
+            RuntimeError: If a frame of this size cannot be recorded as a CUDA graph.
             ValueError: If a sample lacks a field that the encoder reads, or its number of cameras
                 differs from the model.
         """
@@ -211,7 +219,7 @@ class FastFrames:
             pixels = torch.stack(upload(images, self.device))
             images = preprocessor.run_deferred_steps(pixels, samples)
         else:
-            images = torch.stack(list(images))
+            images = torch.stack(list(images))  # on the host; `_run` copies them to the device
         self._add_shapes(batch, image_size=(images.shape[-2], images.shape[-1]))
         metas = [sample.metainfo for sample in samples]
         inputs = [images]
@@ -238,7 +246,7 @@ class FastFrames:
         """
         preprocessor = self.frame.model.data_preprocessor
         shape = padded_size(image_size, preprocessor.pad_size_divisor)
-        pad_shapes = preprocessor._get_pad_shape(batch)
+        pad_shapes = preprocessor._get_pad_shape(batch)  # mmdet3d: padded size of each sample
         for sample, pad_shape in zip(batch["data_samples"], pad_shapes, strict=True):
             sample.set_metainfo({"batch_input_shape": shape, "pad_shape": pad_shape})
 
@@ -266,7 +274,7 @@ class FastFrames:
             # time of the recording. If a weight has changed, drop this result and record again.
             if tensor_versions(self.frame.model) == recording.versions:
                 self._graphs.move_to_end(key)
-                return recording.output.cpu()
+                return recording.output.cpu()  # a copy, as the next replay overwrites the output
             del self._graphs[key]
 
     def _record(self, key: Any, inputs: Sequence[Tensor]) -> _Recording:
@@ -275,11 +283,15 @@ class FastFrames:
         Args:
             key: Shapes and types of the inputs, the key of the recording.
             inputs: Images and calibration arrays.
+
+        Raises:
+            RuntimeError: If the frame cannot be recorded.
         """
         while len(self._graphs) >= _MOST_GRAPHS:
-            self._graphs.popitem(last=False)
+            self._graphs.popitem(last=False)  # the least recently used recording
         buffers = [tensor.to(self.device) for tensor in inputs]
         with torch.cuda.device(self.device):
+            # As torch requires, the frames before a capture run on a separate stream.
             stream = torch.cuda.Stream()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
@@ -288,6 +300,7 @@ class FastFrames:
             torch.cuda.current_stream().wait_stream(stream)
             graph = torch.cuda.CUDAGraph()
             try:
+                # With "thread_local", CUDA calls of other threads do not break the capture.
                 with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                     output = self.frame(*buffers)
             except RuntimeError as error:
@@ -302,18 +315,19 @@ class FastFrames:
         return self._graphs[key]
 
     def _with_predictions(self, sample: "Det3DDataSample", elements: Tensor) -> "Det3DDataSample":
-        """Add the elements inside of the map range to a sample, as its predictions.
+        """Add the elements near the map with a sufficient score to a sample, as its predictions.
 
         Args:
             sample: The sample.
-            elements: Concatenated fields of its elements. (M, F)
+            elements: Concatenated fields of its elements, on the CPU. (M, F)
         """
         head = self.frame.model.map_head
         fields = self.frame.unpack(elements)
-        on_map = head.coder.keep_mask(fields["scores_3d"], fields["pts"])
-        scores = fields.pop("scores_3d")[on_map]
-        labels = fields.pop("labels_3d")[on_map]
-        detections = {name: value[on_map] for name, value in fields.items()}
+        is_valid = head.coder.keep_mask(fields["scores_3d"], fields["pts"])
+        scores = fields.pop("scores_3d")[is_valid]
+        labels = fields.pop("labels_3d")[is_valid]
+        detections = {name: value[is_valid] for name, value in fields.items()}
+        # For some classes, the points of lines are reordered to a short path.
         detections = head.coder.unfold_lines(detections, labels)
         detections.update(scores_3d=scores, labels_3d=labels)
         instances = InstanceData(metainfo=dict(head.reference.metainfo), **detections)

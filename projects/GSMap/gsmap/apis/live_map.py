@@ -19,6 +19,8 @@ from gsmap.structures.streams import Frame, MapStream
 from gsmap.utils.errors import InputError
 
 _LOGGER = logging.getLogger(__name__)
+# Frame of a temporal model without a stream. The model requires a scene, a time and a pose, but
+# does not use them for an independent sample.
 _SINGLE_FRAME = Frame(token="in memory", scene="", timestamp_ns=0, pose=np.eye(4))
 
 if TYPE_CHECKING:
@@ -35,7 +37,10 @@ class Predictor(Protocol):
     model: Any  # MapDetector from `load_model`
 
     def dataset(self, source: Source) -> "VectorizedMapDataset":
-        """Create the test data set of the config with other samples."""
+        """Create the test data set of the config with the samples and the calibration of a source.
+
+        The samples are written to a temporary annotation file, which the data set reads.
+        """
 
     def predict(
         self,
@@ -51,13 +56,14 @@ class Predictor(Protocol):
         Args:
             dataset: Data set from the method ``dataset``.
             allow_missing_cameras: Whether cameras of the model may be absent.
-            stream: Memory of the earlier frames of the drive; None for independent samples.
+            stream: Memory of the earlier frames of the drive, which is updated; None for
+                independent samples.
             priors: Maps of earlier drives, one for each place.
             update_priors: Whether to write the prediction of each sample to ``priors``.
         """
 
     def elements(self, data_sample: "Det3DDataSample") -> MapElements:
-        """Map elements of a predicted sample."""
+        """Map elements of a predicted sample, in the annotation frame of the config, in metres."""
 
 
 class LiveMap:
@@ -98,13 +104,13 @@ class LiveMap:
     ):
         self._priors = () if prior is None else (prior,)
         self._update_prior = update_prior
-        if prior is not None:
+        if prior is not None:  # called for its errors; the result is not needed here
             maps_for(inferencer.model, self._priors, update=update_prior)
         self._inferencer = inferencer
         self._config = inferencer.cfg.test_dataloader.dataset
         self._intrinsics = intrinsics
         self._cam_from_frame = cam_from_frame
-        self._frame = frame or self._config.get("frame") or "lidar"
+        self._frame = frame or self._config.get("frame") or "lidar"  # frame of the calibration
         self._allow_missing_cameras = allow_missing_cameras
         self._sizes: dict[str, tuple[int, ...]] = {}  # shape of the last image of each camera
         self._logged_warnings: set[str] = set()
@@ -185,13 +191,15 @@ class LiveMap:
             raise InputError(f"can_bus must be finite, got {can_bus}.")
         pixels = bgr_by_name(images)
         sizes = {name: image.shape for name, image in pixels.items()}
-        if sizes != self._sizes:
+        if sizes != self._sizes:  # also at the first frame
             self._prepare(pixels)
             self._sizes = sizes
+        # The data set reads these values in place of the image files and the annotation file.
         self._dataset.images_in_memory = pixels
         signals = None if can_bus is None else np.asarray(can_bus, dtype=float)
         self._dataset.can_bus_in_memory = signals
         if at is not None:
+            # Pose of the annotation frame of the model instead of the frame of the calibration.
             frame = replace(at, pose=at.pose @ self._calibration_from_model)
         elif self._inferencer.model.temporal is not None:
             frame = _SINGLE_FRAME
@@ -213,10 +221,16 @@ class LiveMap:
 
         Args:
             pixels: BGR images by the name of the camera. (H, W, 3) each
+
+        Raises:
+            ValueError: If the calibration is not valid, or its cameras differ from the cameras of
+                the images or of the model.
         """
-        # Pose of the annotation frame on the vehicle of the training data.
+        # Pose of the annotation frame on the vehicle of the training data. It is used only if the
+        # calibration is in this annotation frame. None selects the usual pose of the frame.
         training_mount = self._inferencer.model.mount
         mount = training_mount if self._frame == training_mount.frame else None
+        # One sample with names and sizes of the images, and the calibration.
         source = source_in_memory(
             pixels,
             intrinsics=self._intrinsics,
@@ -224,11 +238,12 @@ class LiveMap:
             frame=self._frame,
             mount=mount,
         )
-        for line in calibration_warnings(source.samples, source.frame, source.ground_z_m):
-            if line not in self._logged_warnings:
-                _LOGGER.warning("calibration: %s", line)
-                self._logged_warnings.add(line)
-        model_cameras = self._config.get("cameras") or pixels
+        # Texts about implausible values. Each text is logged once, even if the image sizes change.
+        for text in calibration_warnings(source.samples, source.frame, source.ground_z_m):
+            if text not in self._logged_warnings:
+                _LOGGER.warning("calibration: %s", text)
+                self._logged_warnings.add(text)
+        model_cameras = self._config.get("cameras") or pixels  # a config without names allows all
         unknown = set(pixels) - set(model_cameras)
         # If the model has none of the given names, the cameras are assigned to the cameras of the
         # model by their directions.
@@ -241,7 +256,9 @@ class LiveMap:
         # The inferencer has written a temporary annotation file and the data set has read it. The
         # file is removed now, because each change of the image sizes writes another one.
         Path(dataset.ann_file).unlink()
-        if self._frame == VEHICLE:
+        # The frame of the calibration and the annotation frame of the model are related by the
+        # ground frame of the vehicle (x ahead, y left, origin on the road below the rear axle).
+        if self._frame == VEHICLE:  # which is the ground frame
             ground_from_calibration = np.eye(4)
         else:
             ground_from_calibration = ground_from_frame(

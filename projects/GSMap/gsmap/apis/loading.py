@@ -21,9 +21,10 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import MOUNT, RIG
 
 _LOGGER = logging.getLogger(__name__)
-_USUAL_DATASETS = ("nuscenes", "minicity", "av2")  # data sets with the usual mount of a frame
-# Limits of the values that a checkpoint may contain. A mount is the pose of the annotation frame on
-# the vehicle.
+# Data sets with the usual mount of a frame. A mount is the pose of the annotation frame on the
+# vehicle.
+_USUAL_DATASETS = ("nuscenes", "minicity", "av2")
+# Limits of the values that a checkpoint may contain.
 _FARTHEST_M = 100.0  # of the entries of a mount
 _HIGHEST_M = 10.0  # of the height of the ground
 _LARGEST_PX = 1e5  # of the sizes and intrinsics of cameras
@@ -48,21 +49,24 @@ def load_model(
         The model in evaluation mode, with these additional attributes:
 
         * ``cfg``: Its config, with the settings of its training.
-        * ``mount``: Pose of its annotation frame on the vehicle of the training data.
+        * ``mount``: Pose of its annotation frame on the vehicle of the training data (`Mount`).
         * ``rig``: Cameras of the training data by name: width, height, fx, fy, cx, cy in pixels.
         * ``training_dataset``: Name of the training's data set; empty if unknown.
         * ``without_signals``: Whether the training data is known to lack vehicle signals (CAN bus).
 
     Raises:
         FileNotFoundError: If the config or the checkpoint does not exist.
-        ValueError: If the checkpoint belongs to another architecture, or cannot be read.
+        ValueError: If the config or the checkpoint cannot be read, if the checkpoint belongs to
+            another architecture, or if its settings or its mount are not valid.
     """
     cfg = read_config(config, cfg_options)
     if checkpoint is None and str(config) in named_models():
         checkpoint = str(config)
+    # The file is read once, and the functions below share its contents.
     contents = None if checkpoint is None else read_checked(checkpoint)
-    with building(cfg):
+    with building(cfg):  # adds the names of the config and of its parts to errors
         if checkpoint is not None:
+            # A line for each setting that differs between the config and the checkpoint.
             for line in adopt_settings(
                 cfg, path=checkpoint, cfg_options=cfg_options, checkpoint=contents
             ):
@@ -137,7 +141,8 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
         path: Path of the checkpoint, for messages.
 
     Returns:
-        The mount in the checkpoint, or the usual mount if the checkpoint has no mount.
+        The mount in the checkpoint, or the usual mount of the frame if the checkpoint has no mount
+        or has the mount of another frame. The height of the road may come from the config instead.
 
     Raises:
         ValueError: If the mount in the checkpoint is not possible on a vehicle.
@@ -148,14 +153,15 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
     # A mount in the checkpoint is the pose of the frame that the checkpoint names. It is not used
     # if the config has another frame.
     names_other_frame = meta.get("frame", frame) != frame
-    if names_other_frame or frame not in RANGES:
+    if names_other_frame or frame not in RANGES:  # `RANGES` has the known frames
         return Mount(frame)
-    height = meta.get("ground_z_m")
+    height = meta.get("ground_z_m")  # z of the road in the frame, in metres
     if height is None:
         height = options.get("ground_z_m")
-    matrix = meta.get(MOUNT)
+    matrix = meta.get(MOUNT)  # transform from the frame to the ground below the rear axle
     if height is None and matrix is None:
-        dataset = meta.get("dataset", _USUAL_DATASETS[0])  # older files do not record it
+        # Older files do not record the data set. It is then taken to be a usual one.
+        dataset = meta.get("dataset", _USUAL_DATASETS[0])
         if dataset not in _USUAL_DATASETS:
             _LOGGER.warning(
                 "%s does not say how high its frame %r lies above the road (train it on files with "
@@ -174,7 +180,10 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
 
 
 def _check_height(value: Any) -> float:
-    """Convert a height of the ground in a file to metres; ValueError if it is not possible."""
+    """Convert the height of the ground in a file to a number; ValueError if it is not possible.
+
+    The messages of `_check_height` and `_check_mount` are a part of a message of `_training_mount`.
+    """
     height = float(value)
     if not abs(height) <= _HIGHEST_M:  # refuses NaN as well
         raise InputError(f"the ground is not within {_HIGHEST_M:g} m of it")
@@ -184,7 +193,7 @@ def _check_height(value: Any) -> float:
 def _check_mount(value: Any) -> np.ndarray:
     """Convert a pose in a file to a matrix (4, 4); ValueError if it is not possible."""
     matrix = np.array(value, dtype=np.float64)
-    is_near = matrix.shape == (4, 4) and abs(matrix).max() < _FARTHEST_M
+    is_near = matrix.shape == (4, 4) and abs(matrix).max() < _FARTHEST_M  # refuses NaN as well
     if not is_near or not is_rigid(matrix):
         raise InputError(f"it is not a rigid transform with values below {_FARTHEST_M:g} m")
     return matrix

@@ -1,4 +1,7 @@
-"""Key maps of all map models: their state keys in the authors' code and in this project."""
+"""Key maps of all map models: their state keys in the authors' code and in this project.
+
+State keys are the names of weights in a checkpoint (``state_dict``).
+"""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -11,15 +14,16 @@ from gsmap.methods import METHODS
 from gsmap.utils.errors import InputError
 
 
-@cache
+@cache  # the modules of all models are imported once
 def key_maps() -> tuple[KeyMap, ...]:
     """Key maps of all map models in `METHODS`, the most special first; maps without markers last.
 
-    A marker is a prefix of a key by which a model is recognised. The maps of a model are in
-    ``KEY_MAPS`` of ``gsmap/models/<method>/keys.py``. A model without such a file has no published
-    checkpoints.
+    A marker is a prefix of a key by which a model is recognised. A special model builds on others,
+    and its checkpoints contain their markers, too. It must therefore be tried before them. The maps
+    of a model are in ``KEY_MAPS`` of ``gsmap/models/<method>/keys.py``. A model without such a file
+    has no published checkpoints.
     """
-    num_users: Counter[str] = Counter()
+    num_users: Counter[str] = Counter()  # number of models that build on each model
     for method in METHODS:
         num_users.update(method.built_on)
     # Models are sorted by the number of models that build on them, so a model comes after all
@@ -31,11 +35,13 @@ def key_maps() -> tuple[KeyMap, ...]:
         module = f"gsmap.models.{method.name}.keys"
         if find_spec(module) is not None:
             maps += import_module(module).KEY_MAPS
+    # False sorts before True. Maps with an equal key keep their order.
     return tuple(sorted(maps, key=_has_default_markers))
 
 
 def _has_default_markers(key_map: KeyMap) -> bool:
     """Whether a key map has no markers and so matches the keys of every model."""
+    # The attribute of the class is the default value of the field.
     return key_map.markers == KeyMap.markers
 
 
@@ -50,6 +56,9 @@ def find_key_map(keys: Iterable[str]) -> KeyMap:
 
     Args:
         keys: State keys, of upstream or of this project.
+
+    Returns:
+        The first of `key_maps` whose markers are all present.
 
     Raises:
         ValueError: If there are no keys.

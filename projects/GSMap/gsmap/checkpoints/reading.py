@@ -45,7 +45,8 @@ _DAMAGE = (
 )  # fmt: skip
 # Beginnings of the names of overrides that set the scale of test images.
 _SCALE_OPTIONS = ("image_scale", "test_dataloader.dataset.pipeline")
-_WIDEST_PX = 100_000
+_WIDEST_PX = 100_000  # largest width or height of images that a file may contain
+# End of messages about files and settings that are refused.
 _REMEDY = "if you trust its origin, save its state_dict alone and give that file."
 
 
@@ -92,7 +93,7 @@ def refusing(path: object) -> Iterator[None]:
     """
     try:
         yield
-    except UnfitError as error:
+    except UnfitError as error:  # its message follows the name of the file
         raise InputError(f"{path} {error}.") from error
     except pickle.UnpicklingError as error:
         reason = str(error).split(". ")[0]  # the first sentence of a long message of torch
@@ -111,7 +112,9 @@ def refusing(path: object) -> Iterator[None]:
 
 
 def _remedy_for(path: object, default: str) -> str:
-    """Remedy for a file that cannot be read, chosen by its first bytes.
+    """Remedy for a file that cannot be read.
+
+    Pointers of Git LFS and web pages are recognised by the first bytes of the file.
 
     Args:
         path: File or address of the checkpoint.
@@ -121,6 +124,7 @@ def _remedy_for(path: object, default: str) -> str:
     if not file_path.is_file():
         return default
     with file_path.open("rb") as file:
+        # The caller appends the period of the sentence.
         return fetch_advice(file.read(100), default.rstrip("."))
 
 
@@ -135,6 +139,8 @@ def _exceeds_file_size(error: BaseException, path: Path) -> bool:
 def load_tensors(path: str | Path, map_location: Any = "cpu") -> Any:
     """Load a file of ``torch.save`` without running code from it.
 
+    For a damaged file, `torch.load` raises other exceptions (`_DAMAGE`), which `refusing` converts.
+
     Args:
         path: The file.
         map_location: Device of the tensors, as ``torch.load`` takes it.
@@ -144,7 +150,8 @@ def load_tensors(path: str | Path, map_location: Any = "cpu") -> Any:
 
     Raises:
         ValueError: If the file is an archive with compressed or overlapping parts. Such a small
-            file can fill the memory, and torch never writes one.
+            file can fill the memory, and torch never writes one. The message lacks the path, which
+            `refusing` adds.
         UnpicklingError: If it contains objects other than tensors and plain data.
     """
     if zipfile.is_zipfile(path):
@@ -166,23 +173,30 @@ def read_checked(path: str | Path) -> Checkpoint:
     Args:
         path: File of a training, bare state dict, or name of a model.
 
+    Returns:
+        Weights and metadata. Values that are described as not checked may be anything in the file.
+
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it cannot be read, has no weights, or has weights that are not finite.
     """
     path = find_checkpoint(path)
     with refusing(path):
+        # The message hub in mmengine's checkpoints refers to these classes and functions.
         with torch.serialization.safe_globals(mmengine_globals()):
             content = load_tensors(path)
-        unwrapped = unwrap(content)
+        unwrapped = unwrap(content)  # the state dict, without wrappers around it and in its keys
         if unwrapped.left_out:
             _log_left_out(path, left_out=tuple(unwrapped.left_out.items()))
         # `holder` is the dictionary around the state dict. mmengine stores ``meta`` beside it.
         meta = (unwrapped.holder or {}).get("meta") or {}
         if not isinstance(meta, Mapping):
+            # `refusing` converts this error to ValueError.
             raise TypeError(f"meta must be a dictionary, got {meta!r:.60}")
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
-        facts = {**_facts_of_named_model(path), **meta}  # the file has precedence
+        # The registry has the image size and the signals of its models, which older files lack. The
+        # file has precedence.
+        facts = {**_facts_of_named_model(path), **meta}
         dataset_meta = meta.get("dataset_meta")
         if not isinstance(dataset_meta, Mapping):
             dataset_meta = {}
@@ -215,7 +229,7 @@ def _facts_of_named_model(path: Path) -> dict[str, Any]:
 
 
 def _check_image_size(size: Any) -> tuple[int, int] | None:
-    """Check the image size that a file contains.
+    """Check the image size that a file contains: width and height in pixels; None if it has none.
 
     Raises:
         TypeError: If it is neither None nor a width and a height.
@@ -229,11 +243,11 @@ def _check_image_size(size: Any) -> tuple[int, int] | None:
 
 @cache
 def _log_left_out(path: Path, left_out: tuple[tuple[str, int], ...]) -> None:
-    """Log the unused contents of a checkpoint once.
+    """Log the unused contents of a checkpoint once: the cache skips equal calls.
 
     Args:
         path: File of the checkpoint.
-        left_out: Kinds of entries, with their numbers.
+        left_out: Pairs of a kind of entries and its number, in a tuple that can be a cache key.
     """
     text = ", ".join(f"{count} {kind}" for kind, count in left_out)
     print_log(f"{path}: {text} left out")
@@ -277,14 +291,16 @@ def adopt_settings(
         differs from the checkpoint.
 
     Raises:
-        ValueError: If the settings do not describe a model, or are not allowed (`check_settings`).
+        FileNotFoundError: As in `read_checked`, if the checkpoint is read here.
+        ValueError: If the settings do not describe a model, or are not allowed (`check_settings`);
+            also as in `read_checked`, if the checkpoint is read here.
     """
     if checkpoint is None:
         checkpoint = read_checked(path)
     settings = checkpoint.settings
     overrides = cfg_options or {}
     _adopt_test_data(cfg, checkpoint=checkpoint, overrides=overrides)
-    config = plain(cfg.model.to_dict())
+    config = plain(cfg.model.to_dict())  # in JSON types, as the settings of a checkpoint are
     # The settings of the checkpoint replace ``cfg.model`` below. The value of ``allow_untrained``
     # is kept, because only the config may allow missing weights.
     allow_untrained = cfg.model.setdefault("allow_untrained", False)
@@ -299,6 +315,7 @@ def adopt_settings(
     )
     result = plain(model.to_dict())
     lines: list[str] = []
+    # `differences` returns both values of each setting that differs, by its dotted name.
     for name, (used, configured) in differences(result, others=config, name="model").items():
         if not _is_training_setting(name):
             lines.append(f"{name}: {used}, as {path} was trained; the config has {configured}")
@@ -312,6 +329,8 @@ def adopt_settings(
 
 def _adopt_test_data(cfg: Config, checkpoint: Checkpoint, overrides: dict[str, Any]) -> None:
     """Set the image scale and the signals of the test data to the values of the training.
+
+    A scale that the user sets is kept, and so is ``signals_from_poses`` of the config.
 
     Args:
         cfg: The config; its ``test_dataloader`` is changed.
@@ -343,15 +362,19 @@ def _build_settings(
         overrides: Overrides of the user by dotted name.
 
     Returns:
-        The settings without the overrides, and the settings with the overrides.
+        The settings without the overrides, and the settings with the overrides; both without
+        settings that only training uses.
+
+    Raises:
+        ValueError: If the settings are not allowed, or no model can be built.
     """
     try:
-        settings = check_settings(settings, config=config)
+        settings = check_settings(settings, config=config)  # also removes `TRAINING_SETTINGS`
         settings = _with_elements_of(settings, config=config)
         cfg = Config({"model": settings})
         cfg.merge_from_dict(overrides)
         with building(cfg):
-            MODELS.build(cfg.model)
+            MODELS.build(cfg.model)  # only a test; the caller builds the model again
     except Exception as error:  # unchecked settings can raise any class of exception
         reason = (user_message(error) or f"{type(error).__name__}: {error}").rstrip(".")
         raise InputError(
@@ -378,6 +401,7 @@ def _with_elements_of(settings: dict[str, Any], config: dict[str, Any]) -> dict[
     temporal.pop("elements", None)
     if elements is not None:
         temporal["elements"] = elements
+    # Without any setting left, the model has no temporal part.
     return {**settings, "temporal": temporal or None}
 
 
@@ -402,6 +426,7 @@ def load_weights(model: nn.Module, path: str | Path, checkpoint: Checkpoint | No
         raise InputError(f"{path} does not belong to this config: {error}") from error
     missing: list[str] = []
     for key in result.missing_keys:
+        # Counters of normalisation layers, which old checkpoints lack and prediction does not use.
         if not key.endswith("num_batches_tracked"):
             missing.append(key)
     if missing or result.unexpected_keys:

@@ -9,15 +9,17 @@ from torch import Tensor
 
 from gsmap.utils.errors import InputError
 
+# Keys under which training loops store the state dict, in the order of preference.
 WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "weights")
-_DEEPEST = 3  # nested wrappers
-_OUTER_PREFIXES = ("model.", "network.", "net.")  # removed if all keys start with it
+_DEEPEST = 3  # largest number of nested wrappers
+_OUTER_PREFIXES = ("model.", "network.", "net.")  # each is removed if all keys start with it
 _PARALLEL_PREFIX = "module."  # of parallel training; removed only at the start of a key
+# Parts of keys, between dots, from compiled modules, sharded training and activation checkpoints.
 _WRAPPER_PARTS = ("_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module")
 _AVERAGED = "ema_"  # prefix of keys of exponential moving averages of weights
 _MAX_KEYS_SHOWN = 8  # largest number of keys in a message
 _MOST_REPEATED = 4  # largest ratio of the bytes of all weights to the stored bytes
-_SPARE_BYTES = 1 << 26  # number of bytes that may be repeated in addition
+_SPARE_BYTES = 1 << 26  # number of bytes (64 MiB) that may be repeated in addition
 
 
 class UnfitError(InputError):
@@ -43,18 +45,20 @@ class Unwrapped:
 def unwrap(content: Any) -> Unwrapped:
     """Find the weights in the contents of a checkpoint, and remove wrappers from their keys.
 
-    The weights are under the first key of ``WRAPPERS`` that is present, to a depth of three. If no
-    such key is present, they are the contents themselves, or the only entry that is a state dict.
-    Parts of keys from parallel training, from compiled modules and from modules around the model
-    are removed. Averages next to the averaged weights, counters and entries other than tensors are
-    left out.
+    A wrapper is a dictionary that contains the state dict under one of its keys, or a module around
+    the model that adds a part to every key. The weights are under the first key of ``WRAPPERS``
+    that leads to a state dict, to a depth of three. Without such a key, they are the contents
+    themselves, or the only entry that is a state dict. Parts of keys from parallel training, from
+    compiled modules and from modules around the model are removed. Averages next to the averaged
+    weights, counters and entries other than tensors are left out.
 
     Args:
         content: Contents of the file.
 
     Raises:
-        UnfitError: If there are no weights, or two weights under one key; the message contains the
-            keys.
+        UnfitError: If there are no weights, or two weights under one key (the message contains the
+            keys); if a tensor is sparse, quantized or without values; or if tensors repeat far
+            fewer stored bytes.
     """
     entries = _find_state(content, depth=0)
     if entries is None:
@@ -74,7 +78,8 @@ def unwrap(content: Any) -> Unwrapped:
             del weights[key]
     state = _unwrap_keys(weights)
     averages: set[str] = set()
-    for key in state:  # the average of the weight `a.b` is `ema_a_b`
+    # The average of the weight `a.b` is `ema_a_b`. An average without its weight is kept.
+    for key in state:
         name_of_average = _AVERAGED + key.replace(".", "_")
         if name_of_average in state:
             averages.add(name_of_average)
@@ -126,12 +131,14 @@ def _find_state(content: Any, depth: int) -> Mapping[str, Any] | None:
     if not isinstance(content, Mapping) or depth > _DEEPEST:
         return None
     for name in WRAPPERS:
-        if isinstance(content.get(name), Mapping):
+        if isinstance(content.get(name), Mapping):  # if it leads to no state dict, try the next
             state = _find_state(content[name], depth=depth + 1)
             if state:
                 return state
     if _is_state(content):
         return content
+    # Entries under unknown keys. A state dict without dotted keys could be any dictionary of
+    # tensors.
     states: list[Mapping[str, Any]] = []
     for value in content.values():
         if _is_state(value) and _has_dotted_key(value):
@@ -158,6 +165,7 @@ def _has_dotted_key(state: Mapping[str, Any]) -> bool:
 
 def _is_counter(key: str, value: Tensor) -> bool:
     """Whether an entry is a single number that belongs to no submodule."""
+    # Keys of averages have no dot either, but belong to weights.
     return "." not in key and not key.startswith(_AVERAGED) and value.numel() == 1
 
 
@@ -167,8 +175,9 @@ def _require_stored(weights: Iterable[Tensor]) -> None:
     Raises:
         UnfitError: If the tensors have many more bytes than their storages.
     """
+    # Several tensors may be views of one storage, whose bytes count once. The key is its address.
     bytes_by_storage: dict[int, int] = {}
-    total = 0
+    total = 0  # number of bytes of all tensors, if each had a separate storage
     for value in weights:
         storage = value.untyped_storage()
         bytes_by_storage[storage.data_ptr()] = storage.nbytes()
@@ -189,7 +198,7 @@ def _unwrap_keys(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """
     names = list(map(_remove_wrapper_parts, weights))
     prefix = _common_prefix(names)
-    while prefix:
+    while prefix:  # modules around the model may be nested
         names = [_remove_wrapper_parts(name.removeprefix(prefix)) for name in names]
         prefix = _common_prefix(names)
     state: dict[str, Tensor] = {}
@@ -203,6 +212,7 @@ def _unwrap_keys(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _common_prefix(names: Sequence[str]) -> str:
     """First prefix of a module around the model that all names start with; empty if none."""
     for prefix in _OUTER_PREFIXES:
+        # Without `names`, `all` would be True, and the caller would never stop.
         if names and all(name.startswith(prefix) for name in names):
             return prefix
     return ""

@@ -28,12 +28,19 @@ class _OptionAction(argparse.Action):
     def __call__(
         self, parser: object, namespace: argparse.Namespace, values: Any, option: object = None
     ) -> None:
+        earlier_overrides = dict(getattr(namespace, "cfg_options", None) or {})
+        earlier_value = getattr(namespace, self.dest, None)
+        if earlier_value is not None:  # the option is given twice, and the last value counts
+            for key in self._overrides(earlier_value):
+                earlier_overrides.pop(key, None)
         setattr(namespace, self.dest, values)
-        overrides = {self.dest: values}  # `read_config` scales all images by ``image_scale``
+        namespace.cfg_options = {**self._overrides(values), **earlier_overrides}
+
+    def _overrides(self, value: Any) -> dict[str, Any]:
+        """Return the config overrides for a value of the option."""
         if self.dest == "data_root":
-            overrides = data_root_options(values)
-        earlier_overrides = getattr(namespace, "cfg_options", None) or {}
-        namespace.cfg_options = {**overrides, **earlier_overrides}
+            return data_root_options(value)
+        return {self.dest: value}  # `read_config` scales all images by ``image_scale``
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:

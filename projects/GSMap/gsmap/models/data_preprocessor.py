@@ -30,6 +30,8 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             device_types.add(tensor.device.type)
         if self.device.type == "cpu" or "cpu" not in device_types:
             return super().cast_data(data)  # nothing has to be copied from the host to a GPU
+        # Copies by the `id` of their originals. `tensors` keeps the originals alive, so that no
+        # `id` is used twice.
         replacements = {}
         copies = upload(tensors, device=self.device)
         for tensor, copy in zip(tensors, copies, strict=True):
@@ -42,7 +44,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
         if not _have_one_size(images):
             return super().collate_data(data)  # pads each image to the largest one
         data = self.cast_data(data)
-        imgs = torch.stack(data["inputs"]["img"])
+        imgs = torch.stack(data["inputs"]["img"])  # (B, V, 3, H, W)
         imgs = self.run_deferred_steps(imgs, samples=data.get("data_samples") or ())
         data["inputs"]["imgs"] = self.normalise(imgs)
         data.setdefault("data_samples", None)
@@ -74,6 +76,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
         if self._enable_normalize:
             images = (images - self.mean).div_(self.std)
         height, width = images.shape[-2:]
+        # Height and width, rounded up to multiples of the divisor.
         rows, columns = padded_size((height, width), divisor=self.pad_size_divisor)
         if (rows, columns) == (height, width):
             return images
@@ -101,7 +104,7 @@ def run_image_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
             sample_images = images[index : index + 1]  # (1, V, 3, H, W)
             samples.append(run_image_steps(sample_images, steps=[sample_steps]))
         return torch.cat(samples)
-    images = images.flatten(start_dim=0, end_dim=1)
+    images = images.flatten(start_dim=0, end_dim=1)  # (B * V, 3, H, W)
     for step in batch_steps:
         images = step.on_device(images)
     return images.unflatten(dim=0, sizes=batch_shape)
@@ -121,6 +124,7 @@ def _join_steps(steps: Sequence[Sequence[Any]]) -> list[Any] | None:
     batch_steps = []
     for position in range(num_steps):
         first, *others = [sample_steps[position] for sample_steps in steps]
+        # `join` returns one step for the images of all samples, or None if the steps differ.
         step = first.join(others)
         if step is None:
             return None
@@ -172,5 +176,5 @@ def _replace_tensors(data: Any, replacements: Mapping[int, Tensor]) -> Any:
             items.append(_replace_tensors(item, replacements))
         if isinstance(data, list):
             return items
-        return type(data)._make(items) if hasattr(data, "_make") else tuple(items)
+        return type(data)._make(items) if hasattr(data, "_make") else tuple(items)  # NamedTuple
     return data

@@ -46,11 +46,8 @@ class PriorSettings:
         if not 0.01 <= self.cell_m <= 10:
             raise InputError(f"cell_m must be in [0.01, 10], got {self.cell_m}.")
         cells = self.tile_m / self.cell_m
-        # For a tile of 1024 cells, rounding may make the quotient slightly larger, so the upper
-        # limit has a margin. The test for a whole number rejects all other quotients in the margin.
-        # The lower limit has no margin, since both sides of a tile with one cell are equal.
-        is_in_range = 1 <= cells <= _MOST_TILE_CELLS + 0.5
-        if not is_in_range or abs(cells - round(cells)) > 1e-6:
+        is_whole = abs(cells - round(cells)) <= 1e-6  # the quotient is rounded
+        if not is_whole or not 1 <= round(cells) <= _MOST_TILE_CELLS:
             raise InputError(
                 f"tile_m must be 1 to {_MOST_TILE_CELLS} cells of {self.cell_m:g} m, got "
                 f"{self.tile_m:g} m."

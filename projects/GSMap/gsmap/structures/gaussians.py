@@ -14,8 +14,10 @@ from gsmap.utils.errors import InputError
 
 ACTIVATIONS = ("sigmoid", "softplus", "exp")
 _ROUND = 1e-6  # relative difference of both variances below which a Gaussian has no direction
-_MARGIN = 1e-4  # distance of an encoded sigma from the ends of its range, as a share of the range
-_TINY = 1e-12  # square metres; a shorter segment has no direction
+# Distance of an encoded sigma from the ends of its range, as a share of the range. At the ends, the
+# inverse of the activation may be infinite.
+_MARGIN = 1e-4
+_TINY = 1e-12  # lower bound of squared lengths in square metres, which are divisors or under a root
 AT_FLOOR = 1.1  # a Gaussian is at the lower bound if both sigmas are below this multiple of it
 
 
@@ -71,6 +73,7 @@ class GaussianSpace:
     _start: tuple[float, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        # A frozen dataclass can only be set by `object.__setattr__`.
         object.__setattr__(self, "init_scales_m", tuple(float(s) for s in self.init_scales_m))
         if not all(0 < self.min_scale_m < s < self.max_scale_m for s in self.init_scales_m):
             raise InputError(
@@ -121,7 +124,9 @@ class GaussianSpace:
         shifted = raw + constant(raw, self._start)
         if self.activation == "sigmoid":
             span = constant(raw, self.max_scale_m - self.min_scale_m)
+            # min + (max - min) sigmoid(s + s_0) in one operation.
             return torch.addcmul(constant(raw, self.min_scale_m), shifted.sigmoid(), span)
+        # `above` is the distance of sigma from its lower bound, in metres.
         above = F.softplus(shifted) if self.activation == "softplus" else shifted.exp()
         return (self.min_scale_m + above).clamp(max=self.max_scale_m)
 
@@ -173,7 +178,8 @@ class GaussianSpace:
         Args:
             reference: References of the decoder. (..., D)
             invariant: Whether to compute the invariant matrices.
-            cell_m: Size of a cell along x and y in metres, for offsets in cells.
+            cell_m: Size of a cell along x and y in metres, if the offsets are in cells. The default
+                is for offsets in metres.
 
         Returns:
             Matrices that multiply offsets (x, y) from the left. (..., 2, 2)
@@ -183,11 +189,12 @@ class GaussianSpace:
         if self.literal_covariance:
             scales = scales.square()
         # Computed like the scales, so that the quotient is exactly one for the initial Gaussian.
+        # The cache key has this object, because the values depend on its settings.
         start = cached_constant(
             scales, (self, "start", scales.dtype), make=lambda: self._initial_scales(scales)
         )
         stretch = scales / start
-        theta = reference[..., -1:]
+        theta = reference[..., -1:]  # angle from the direction of travel
         # Factors of the entries off the diagonal, for offsets in cells that are not square.
         x_per_y = cell_m[0] / cell_m[1]
         y_per_x = cell_m[1] / cell_m[0]
@@ -219,7 +226,14 @@ class GaussianSpace:
         return start.square() if self.literal_covariance else start
 
     def _double_angle(self, theta: Tensor) -> Tensor:
-        """Cosine and sine of twice the angle from +x. (..., 1) -> (..., 2)"""
+        """Cosine and sine of twice the angle from +x.
+
+        Args:
+            theta: Angle from the direction of travel, as in a reference. (..., 1)
+
+        Returns:
+            Cosine and sine, which are equal for theta and theta + pi. (..., 2)
+        """
         return _cos_and_sin(theta, factor=2.0, shift_rad=2 * self.heading_rad)
 
     def describe(self, reference: Tensor) -> Tensor:
@@ -231,6 +245,7 @@ class GaussianSpace:
         Returns:
             mu in [-1, 1], sigma before its activation, cosine and sine of 2 theta. (..., 6)
         """
+        # 2 * centre - 1 in one operation.
         centre = torch.add(constant(reference, -1.0), reference[..., :2], alpha=2)
         angle = self._double_angle(reference[..., -1:])
         return torch.cat([centre, reference[..., -3:-1], angle], dim=-1)
@@ -307,6 +322,7 @@ def move_gaussians(
     drift_m = drift_m.to(shift).view((*shape, 1, 1))
     drift_rad = drift_rad.to(shift).view((*shape, 1, 1))
     means = (turn @ gaussians.means[..., None])[..., 0] + shift
+    # The new centre turned by 90 degrees, p in the equation.
     aside = torch.stack([-means[..., 1], means[..., 0]], dim=-1)[..., None]
     covariance = turn @ covariances(gaussians) @ turn.transpose(-1, -2)
     noise = drift_m.square() * torch.eye(2).to(shift)
@@ -358,6 +374,7 @@ def gaussians_along(points: Tensor, across_m: float) -> Gaussians:
     """
     steps = points.diff(dim=-2).norm(dim=-1)
     inner = (steps[..., 1:] + steps[..., :-1]) / 2
+    # An end of a line has only one neighbour.
     distances = torch.cat([steps[..., :1], inner, steps[..., -1:]], dim=-1)
     along = (distances / 2).clamp(min=across_m)
     scales = torch.stack([along, torch.full_like(along, across_m)], dim=-1)
@@ -365,7 +382,11 @@ def gaussians_along(points: Tensor, across_m: float) -> Gaussians:
 
 
 def angles_of_line(points: Tensor) -> Tensor:
-    """Direction of a line at each point, in radians from +x. (..., P, 2) -> (..., P)"""
+    """Direction of a line at each point, in radians from +x. (..., P, 2) -> (..., P)
+
+    It is the direction from the previous point to the next one. At an end of the line, the point
+    itself replaces the missing one.
+    """
     padded = torch.cat([points[..., :1, :], points, points[..., -1:, :]], dim=-2)
     along = padded[..., 2:, :] - padded[..., :-2, :]
     return torch.atan2(along[..., 1], along[..., 0])
@@ -418,15 +439,16 @@ def stretch_along_line(gaussians: Gaussians, factors: Tensor) -> Gaussians:
     cos = (gaussians.rotations - angles).cos()
     sin = (gaussians.rotations - angles).sin()
     first, second = gaussians.scales.square().unbind(-1)
-    # In the directions along and across, the covariance is [[along, both], [both, across]].
-    both = factors.prod(-1) * (first - second) * sin * cos
+    # In the directions along and across, the covariance is [[along, cross], [cross, across]].
+    cross = factors.prod(-1) * (first - second) * sin * cos
     along = factors[..., 0].square() * (first * cos.square() + second * sin.square())
     across = factors[..., 1].square() * (first * sin.square() + second * cos.square())
-    spread = ((along - across).square() / 4 + both.square()).sqrt()
-    longer = ((along + across) / 2 + spread).sqrt()
+    # The larger eigenvalue of the matrix is its mean diagonal entry plus `radius`.
+    radius = ((along - across).square() / 4 + cross.square()).sqrt()
+    longer = ((along + across) / 2 + radius).sqrt()
     # The factors multiply the area of the ellipse, which is proportional to longer * shorter.
     shorter = gaussians.scales.prod(-1) * factors.prod(-1) / longer
-    turn = torch.atan2(2 * both, along - across) / 2
+    turn = torch.atan2(2 * cross, along - across) / 2  # of the longer axis from the line
     scales = torch.stack([longer, shorter], dim=-1)
     return Gaussians(gaussians.means, scales, rotations=angles + turn)
 
@@ -445,7 +467,7 @@ def line_errors(points: Tensor, targets: Tensor, lines: Tensor | None = None) ->
         lines: True lines at full resolution, in metres; None to use the targets. (..., S, 2)
 
     Returns:
-        Errors along and across in metres, >= 0. (..., P, 2)
+        Errors along and across in metres, >= 0; errors across are at least 1e-6. (..., P, 2)
     """
     angles = angles_of_line(points)
     direction = torch.stack([angles.cos(), angles.sin()], dim=-1)
@@ -453,19 +475,20 @@ def line_errors(points: Tensor, targets: Tensor, lines: Tensor | None = None) ->
     lines = targets if lines is None else lines
     steps = lines.diff(dim=-2)[..., None, :, :]  # (..., 1, S - 1, 2)
     offsets = points[..., None, :] - lines[..., None, :-1, :]  # (..., P, S - 1, 2)
-    lengths = steps.square().sum(-1)
-    # Position of the nearest place on each segment: 0 at its start and 1 at its end.
-    place = (offsets * steps).sum(-1) / lengths.clamp(min=_TINY)
+    squared_lengths = steps.square().sum(-1)
+    # Position of the nearest point on each segment: 0 at its start and 1 at its end.
+    position = (offsets * steps).sum(-1) / squared_lengths.clamp(min=_TINY)
     # The position is clamped to [0, 1]. Only on an open line, it may be less than 0 on the first
     # segment and more than 1 on the last segment.
     closed = (lines[..., :1, :] == lines[..., -1:, :]).all(-1, keepdim=True)  # (..., 1, 1)
     beyond = torch.where(closed, 0.0, torch.inf)
-    inner = torch.zeros_like(lengths[..., 1:])  # (..., 1, S - 2)
+    inner = torch.zeros_like(squared_lengths[..., 1:])  # (..., 1, S - 2)
     # Lower limits are 0, but -inf on the first segment of an open line. Upper limits are 1, but inf
     # on the last segment of an open line. (..., 1, S - 1)
     low = torch.cat([-beyond, inner], dim=-1)
     high = torch.cat([inner, beyond], dim=-1) + 1
-    nearest = place.clamp(low, high)[..., None] * steps
-    squared = (offsets - nearest).square().sum(-1)
-    across = squared.amin(-1).clamp(min=_TINY).sqrt()
+    nearest = position.clamp(low, high)[..., None] * steps  # from the start of each segment
+    squared_distances = (offsets - nearest).square().sum(-1)
+    # The root has an infinite gradient at zero, so the distance is clamped.
+    across = squared_distances.amin(-1).clamp(min=_TINY).sqrt()
     return torch.stack([along, across], dim=-1)

@@ -48,13 +48,14 @@ class BEVGrid:
             high = float(high)
             if not low < high:
                 raise InputError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
-            # Configs have lists here; tuples make the grid hashable.
+            # Configs have lists here; tuples make the grid hashable. A frozen dataclass can only be
+            # set by `object.__setattr__`.
             object.__setattr__(self, name, (low, high))
         if self.height < 1 or self.width < 1:
             raise InputError(f"height and width must be >= 1, got {self.height} x {self.width}.")
         if self.forward is None:
-            wide = self.extent_m[0] > self.extent_m[1]
-            object.__setattr__(self, "forward", "x" if wide else "y")
+            is_wide = self.extent_m[0] > self.extent_m[1]
+            object.__setattr__(self, "forward", "x" if is_wide else "y")
         elif self.forward not in ("x", "y"):
             raise InputError(f"forward must be 'x' or 'y', got {self.forward!r}.")
 
@@ -93,6 +94,7 @@ class BEVGrid:
         width = round(columns)
         height = round(rows)
         is_empty = width < 1 or height < 1
+        # Sizes such as 0.15 m have no exact float, so quotients are rarely whole numbers.
         rounding = max(abs(columns - width), abs(rows - height))
         if is_empty or rounding > 1e-3:
             raise InputError(
@@ -150,8 +152,8 @@ class BEVGrid:
         Therefore `metres_from_front` applies the same steps in the reverse order.
         """
         if self.forward == "x":
-            return [0, 1], (-1, -1), (1, 1)
-        return [1, 0], (-1, 1), (1, 0)
+            return [0, 1], (-1, -1), (1, 1)  # (x, y) -> (1 - x, 1 - y), since left is at large y
+        return [1, 0], (-1, 1), (1, 0)  # (x, y) -> (1 - y, x), since left is at small x
 
     def _count_from_corner(self, points: Array, sizes_m: tuple[float, float]) -> Array:
         """Convert metres to multiples of ``sizes_m`` from the lower corner. (..., 2) -> (..., 2)"""
@@ -200,6 +202,7 @@ def _affine(points: Array, scale: tuple[float, float], shift: tuple[float, float
         return np.concatenate([xy, points[..., 2:]], axis=-1).astype(points.dtype, copy=False)
     import torch
 
+    # Numbers of Python need no copy to a GPU, as tensors would.
     x = points[..., 0] * scale[0] + shift[0]
     y = points[..., 1] * scale[1] + shift[1]
     return torch.cat([torch.stack([x, y], dim=-1), points[..., 2:]], dim=-1)

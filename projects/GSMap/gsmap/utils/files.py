@@ -35,13 +35,14 @@ SUFFIX = ".gsmap-partial"  # ending of temporary files, which no other program u
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # an ID shared by all containers of a machine
 # Eight digits that identify this machine until its next start.
 _MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(nbytes=4)
+# Name of a temporary file. The group is the machine of its writer.
 _PARTIAL_NAME = re.compile(
     rf".+\.([0-9a-f]{{8}})-[0-9a-f]{{8}}{re.escape(SUFFIX)}", flags=re.DOTALL
 )
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
 _STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to the open files of a process
-_REGISTERED_FOLDERS: set[Path] = set()  # filled by `register_folder`
+_REGISTERED_FOLDERS: set[Path] = set()  # folders of the running command, see `register_folder`
 _HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # content of a lock file
 _DIGEST_ENDING = re.compile(r"-[0-9a-f]{16}\Z")  # ending of names that `file_name` has changed
 # Exceptions of `zipfile` for a damaged archive
@@ -167,28 +168,28 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
         InputReplacedError: If the file is an input of the command (`inputs.declare_files`).
     """
     path = Path(path)
-    require_no_input(path)
+    require_no_input(path)  # raises InputReplacedError
     for folder in _REGISTERED_FOLDERS:
         if path.is_relative_to(folder):
             require_no_link(path.parent, below=folder.parent)
     encoding = None if "b" in mode else "utf-8"
     is_special = _is_special(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    failures: list[OSError] = []
+    failures: list[OSError] = []  # write errors, which `_RawFile` appends
     try:
         with (
             nullcontext(path) if is_special else partial_path(path) as partial_file,
             io.BufferedWriter(_RawFile(partial_file, failures=failures)) as buffer,
             buffer if encoding is None else io.TextIOWrapper(buffer, encoding=encoding) as file,
         ):
-            if not is_special:
+            if not is_special:  # the temporary file replaces `path`
                 _keep_mode(path=path, handle=file.fileno())
             yield file
             file.flush()
             if not is_special:
                 os.fsync(file.fileno())
-                # A command must not read a file that it will replace (`inputs.declare_files`). The
-                # new file may be read.
+                # A command must not read a file that it will replace (`inputs.declare_files`). From
+                # here on the file is the new one, which may be read.
                 forget_output(path)
                 os.replace(partial_file, path)
     except Exception as raised:
@@ -241,6 +242,8 @@ def open_to_append(path: Path) -> io.FileIO:
     Raises:
         ValueError: If the path is a link, a pipe or a folder, or a file with several hard links.
     """
+    # O_NONBLOCK: opening a pipe does not wait. The type is checked again after opening, because
+    # another process may have replaced the file in between.
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     status = None
     with suppress(FileNotFoundError):
@@ -267,7 +270,7 @@ def require_no_link(path: Path, below: Path | None = None) -> None:
     Raises:
         ValueError: If one of these folders is a link.
     """
-    top = path.parent if below is None else below
+    top = path.parent if below is None else below  # not checked
     for folder in (path, *path.parents):
         if folder == top:
             return
@@ -372,6 +375,7 @@ def partial_path(path: Path, make: Callable[[Path], object] = _touch) -> Iterato
         # this case, the loop tries again.
         with suppress(FileNotFoundError):
             handle = _open(temporary)
+            # None, a file system without locks, is accepted.
             if try_lock(handle) is not False and temporary.exists():
                 break
             os.close(handle)
@@ -418,6 +422,8 @@ def lock(file: IO[Any] | int, message: str) -> None:
         logging.getLogger("gsmap").warning(text)
 
 
+# Open lock files of this process. Weak references do not keep a file open that its user has
+# dropped.
 _LOCK_FILES: "weakref.WeakSet[IO[str]]" = weakref.WeakSet()
 
 
@@ -471,7 +477,7 @@ def lock_file(path: Path, subject: Path, advice: str) -> IO[str]:
     file = io.TextIOWrapper(io.BufferedRandom(raw), encoding="utf-8", errors="replace")
     _LOCK_FILES.add(file)
     file.seek(0)
-    holder = file.read(200)
+    holder = file.read(200)  # text of the last process that held the lock; empty in a new file
     if not _HOLDER.fullmatch(holder):
         raise InputError(f"{path} is another program's file: write elsewhere.")
     lock(file, message=f"{subject} is in use by {holder or 'another process'}: {advice}.")
@@ -496,6 +502,7 @@ def _remove_leftovers(folder: Path) -> None:
             try:
                 age_s = time.time() - os.fstat(handle).st_mtime
                 is_of_this_machine = match[1] == _MACHINE
+                # A lock on success only: without locks (None), a writer may still be at work.
                 if (is_of_this_machine or age_s > _DAY_S) and try_lock(handle):
                     _remove(folder / name)
             finally:
@@ -509,6 +516,7 @@ def _open(path: Path) -> int:
 
 
 def _remove(path: Path) -> None:
+    """Remove a file or a folder, if it still exists."""
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:

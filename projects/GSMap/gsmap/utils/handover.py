@@ -13,6 +13,7 @@ _REMEDY = (
     "-f), or read in the command's own process: num_workers=0, persistent_workers=False, "
     "--workers 1"
 )
+# Method that Python calls in the sending thread when an item cannot be sent.
 _default_handler = queues.Queue._on_queue_feeder_error  # type: ignore[attr-defined]
 
 
@@ -30,6 +31,7 @@ def _send_error(queue: "queues.Queue[Any]", error: Exception, item: Any) -> None
     # Imported here, so that importing this module does not load torch. Workers have loaded torch.
     from torch._utils import ExceptionWrapper
 
+    # A worker sends tuples (index of the batch, batch or error).
     index: Any = None
     batch: Any = None
     if isinstance(item, tuple) and len(item) == 2:

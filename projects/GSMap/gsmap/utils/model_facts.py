@@ -36,7 +36,8 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
     entries: Mapping[str, Any] = calibration if isinstance(calibration, Mapping) else {}
     law = entries.get("law")
     sigmas = entries.get("sigmas")
-    if law not in LAW_NAMES or not isinstance(sigmas, int | float) or not 0 < sigmas <= 3:
+    is_number = isinstance(sigmas, int | float) and not isinstance(sigmas, bool)
+    if law not in LAW_NAMES or not is_number or not 0 < sigmas <= 3:
         raise InputError(
             f"{CALIBRATION} must name a law of {LAW_NAMES} and sigmas in (0, 3], got "
             f"{calibration!r:.60}."

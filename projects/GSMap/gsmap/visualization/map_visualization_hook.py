@@ -17,7 +17,7 @@ from gsmap.visualization.map_visualizer import MapVisualizer
 
 
 def _points(data_batch: Any, index: int) -> np.ndarray | None:
-    """LiDAR points of one sample of a batch, if it has any. (n, >= 2)"""
+    """LiDAR points of one sample of a batch in the annotation frame, or None. (n, >= 2)"""
     if not isinstance(data_batch, dict):
         return None
     clouds = data_batch.get("inputs", {}).get("points")
@@ -25,7 +25,7 @@ def _points(data_batch: Any, index: int) -> np.ndarray | None:
 
 
 def _visualizer(runner: Runner) -> MapVisualizer:
-    """Visualizer of the runner, which must be a ``MapVisualizer``."""
+    """Visualizer of the runner, which must be a ``MapVisualizer``; otherwise TypeError."""
     if not isinstance(runner.visualizer, MapVisualizer):
         raise InputTypeError(
             "MapVisualizationHook needs visualizer=dict(type='MapVisualizer') in the config, "
@@ -35,7 +35,7 @@ def _visualizer(runner: Runner) -> MapVisualizer:
 
 
 @HOOKS.register_module()
-@dataclass(eq=False)
+@dataclass(eq=False)  # hooks are compared by identity
 class MapVisualizationHook(Hook):
     """Hook that draws predictions: to a folder in testing, to visualizer backends in validation.
 
@@ -46,7 +46,8 @@ class MapVisualizationHook(Hook):
         draw: Whether to draw at all.
         interval: In testing, draw every ``interval``-th sample of a rank.
         num_val_samples: Number of samples that are drawn in validation.
-        test_out_dir: Folder for the pictures of a test (``tools/test.py --show-dir``).
+        test_out_dir: Folder for the pictures of a test (``tools/test.py --show-dir``); None to draw
+            no pictures in testing.
 
     Raises:
         ValueError: If ``interval`` is smaller than 1.
@@ -56,6 +57,7 @@ class MapVisualizationHook(Hook):
     interval: int = 1
     num_val_samples: int = 4
     test_out_dir: str | None = None
+    # Number of samples of this rank in the test so far; 0 if no pictures are drawn.
     _num_samples: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
@@ -75,6 +77,7 @@ class MapVisualizationHook(Hook):
         """
         if not self.draw or not outputs or runner.rank != 0:
             return
+        # Number of batches between two drawn ones. Both maxima prevent a stride or a divisor of 0.
         stride = max(len(runner.val_dataloader) // max(self.num_val_samples, 1), 1)
         is_at_stride = batch_idx % stride == 0
         num_drawn = batch_idx // stride
@@ -82,7 +85,9 @@ class MapVisualizationHook(Hook):
             return
         name = file_name(f"val_{outputs[0].metainfo['token']}")
         points = _points(data_batch, 0)
-        _visualizer(runner).add_datasample(name, None, outputs[0], step=runner.iter, points=points)
+        visualizer = _visualizer(runner)
+        # The image argument is None, so the original image files are drawn.
+        visualizer.add_datasample(name, None, outputs[0], step=runner.iter, points=points)
 
     def before_test_epoch(self, runner: Runner) -> None:
         """Reset the number of tested samples."""
@@ -109,11 +114,11 @@ class MapVisualizationHook(Hook):
             self._num_samples += 1
 
     def after_test_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
-        """Log the number of pictures and their folder.
+        """Log the number of pictures of this rank and their folder.
 
         Args:
             runner: Runner of the test.
-            metrics: Metrics of the test.
+            metrics: Metrics of the test, not used.
         """
         if self._num_samples:
             count = math.ceil(self._num_samples / self.interval)

@@ -11,6 +11,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 
 _NUSCENES_SCENE = re.compile(r"scene-(\d{4})")
+# Fields of a message: time in microseconds, acceleration, rotation rate and velocity.
 _FIELDS = ("utime", "accel", "rotation_rate", "vel")
 Messages = tuple[np.ndarray, np.ndarray]
 """Ascending times in microseconds (n,), and acceleration in m/s^2, rotation rate in rad/s and
@@ -31,6 +32,7 @@ def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Message
     """
     signals = pose_signals(global_from_ego)
     times_us, measurements = messages
+    # Signals 7 to 15 do not follow from the pose, and `pose_signals` leaves them zero.
     # Index of the latest message at or before the time; -1 if there is no such message.
     latest = int(np.searchsorted(times_us, timestamp_ns // 1000, side="right")) - 1
     if latest >= 0:

@@ -1,4 +1,8 @@
-"""Records of samples and metadata in an annotation file."""
+"""Records of samples and metadata in an annotation file.
+
+Records with arrays are compared by identity (``eq=False``), because arrays have no single truth
+value.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,11 +14,12 @@ from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 FORMAT_VERSION = 1
 UNITED = "united"  # default rule for pedestrian crossings: they are joined where they overlap
-_MAX_GROUND_Z_M = 10.0
+_MAX_GROUND_Z_M = 10.0  # largest absolute height of the road
 _MAX_CLASSES = 1000
-CLASSES = ("divider", "ped_crossing", "boundary")
+CLASSES = ("divider", "ped_crossing", "boundary")  # the usual classes, in label order
 RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
-"""Usual range of each annotation frame: (smallest, largest) x and y in metres."""
+"""Usual range of each annotation frame: smallest and largest x, then smallest and largest y, in
+metres. The larger range is along the direction of travel, y of ``lidar`` and x of ``ego``."""
 
 
 @dataclass(eq=False)
@@ -41,7 +46,11 @@ class CameraRecord:
 
     @property
     def img_from_frame(self) -> np.ndarray:
-        """Projection from the annotation frame in metres to the image in pixels. (4, 4)"""
+        """Projection from the annotation frame in metres to the image in pixels.
+
+        It maps (x, y, z, 1) to (u * d, v * d, d, 1), with the pixel (u, v) and the depth d in
+        metres. (4, 4)
+        """
         projection = np.eye(4)
         projection[:3] = self.intrinsics @ self.cam_from_frame[:3]
         return projection
@@ -104,8 +113,8 @@ class MapSample:
         cameras: Cameras with an image.
         global_from_frame: Pose of the annotation frame in the global frame of the map, in metres.
             (4, 4)
-        lidar: LiDAR sweep, or None.
-        can_bus: Vehicle signals in the layout of MapTR, or None. (18,)
+        lidar: LiDAR sweep; None for a sample without LiDAR.
+        can_bus: Vehicle signals in the layout of MapTR; None if they are unknown. (18,)
         instances: Map elements. The list may be empty; None means that ground truth is unknown.
         ego_from_frame: Transform in metres from the annotation frame to the vehicle. None means the
             identity in the annotation frame ``ego``, and unknown in other frames. (4, 4)
@@ -151,7 +160,7 @@ class AnnotationMeta:
         dim: Number of coordinates per point, 2 or 3.
         source_fingerprint: Digest of the source data; empty if unknown.
         versions: Versions of the libraries that were used for the conversion.
-        options: Options of the conversion that change the content.
+        options: Options of the conversion that change the content, by name.
         command: Command that creates the file, for messages.
         format_version: Version of the file format.
         ground_z_m: Height of the road in the frame in metres, for samples without
@@ -199,9 +208,9 @@ class AnnotationMeta:
             if value is None:
                 value = usual_range
             low, high = (float(limit) for limit in value)
-            if not -np.inf < low < high < np.inf:
+            if not -np.inf < low < high < np.inf:  # also refuses NaN
                 raise InputError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
-            object.__setattr__(self, name, (low, high))
+            object.__setattr__(self, name, (low, high))  # the class is frozen
 
     @property
     def split_list(self) -> str:
@@ -210,5 +219,8 @@ class AnnotationMeta:
 
     @property
     def crossings(self) -> str:
-        """Rule for pedestrian crossings, see ``tools/create_data.py nuscenes --help``."""
+        """Rule by which pedestrian crossings become elements, by default ``united``.
+
+        The rules are listed in ``tools/create_data.py nuscenes --help``.
+        """
         return self.options.get("crossings", UNITED)

@@ -18,7 +18,7 @@ from mmdet3d.datasets.transforms import PhotoMetricDistortion3D
 from mmdet3d.registry import TRANSFORMS
 from torch import Tensor
 
-_EPSILON = float(np.finfo(np.float32).eps)  # OpenCV adds it to divisors
+_EPSILON = float(np.finfo(np.float32).eps)  # OpenCV adds it to divisors in its colour conversion
 
 
 class ImageStep(Protocol):
@@ -34,7 +34,8 @@ class ImageStep(Protocol):
         """Join this step and the steps of the other samples of a batch to one step for all images.
 
         Returns:
-            The joint step, or None if the steps cannot be joined.
+            The joint step, or None if the steps cannot be joined. The samples are then processed
+            one by one.
         """
 
 
@@ -58,7 +59,7 @@ def shape_after_steps(results: dict[str, Any]) -> tuple[int, int]:
     Args:
         results: Results of the pipeline so far.
     """
-    if results.get("image_steps"):
+    if results.get("image_steps"):  # transforms that record a step update `img_shape`
         return results["img_shape"]
     return results["img"][0].shape[:2]
 
@@ -66,7 +67,7 @@ def shape_after_steps(results: dict[str, Any]) -> tuple[int, int]:
 def finish_on_host(results: dict[str, Any]) -> None:
     """Apply all recorded steps in float32, before a transform that reads pixels.
 
-    Later steps are applied directly.
+    Without ``image_steps`` in the results, `take_step` applies later steps directly.
 
     Args:
         results: Results of the pipeline so far; ``image_steps`` is removed.
@@ -103,17 +104,19 @@ class Resize:
             return [mmcv.imresize(image, self.size) for image in images]
         resized_images = []
         for image in images:
-            grey_levels = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+            # Pillow resizes colour images in uint8 only.
+            whole_numbers = np.clip(np.rint(image), 0, 255).astype(np.uint8)
             resized = mmcv.imresize(
-                grey_levels, self.size, interpolation="bicubic", backend="pillow"
+                whole_numbers, self.size, interpolation="bicubic", backend="pillow"
             )
             resized_images.append(resized.astype(image.dtype))
         return resized_images
 
     def on_device(self, images: Tensor) -> Tensor:
         """See `ImageStep`."""
+        # `size` is (width, height), and torch takes (height, width).
         if self.kernel == "bicubic":
-            # Pillow resizes the width first.
+            # Pillow resizes the width first, and rounds before it resizes the height.
             images = _resize_bicubic(images, size=(images.shape[2], self.size[0]))
             return _resize_bicubic(images, size=self.size[::-1])
         resized = F.interpolate(
@@ -174,6 +177,7 @@ class Distortion:
 
     def on_host(self, images: list[np.ndarray]) -> list[np.ndarray]:
         """See `ImageStep`."""
+        # `photometric_param` has all random parameters, so the default ranges are not used.
         distort = PhotoMetricDistortion3D().transform
         distorted_images = []
         for image, numbers in zip(images, self.numbers, strict=True):
@@ -185,7 +189,7 @@ class Distortion:
         """See `ImageStep`."""
         rows = [_distortion_row(numbers) for numbers in self.numbers]
         table = torch.from_numpy(np.array(rows, dtype=np.float32))  # (V, 8)
-        if images.is_cuda:
+        if images.is_cuda:  # a copy from pinned memory does not wait for the GPU
             table = table.pin_memory().to(images.device, non_blocking=True)
         return distort_images(images, table.to(images.device))
 
@@ -239,6 +243,7 @@ def distort_images(images: Tensor, numbers: Tensor) -> Tensor:
     hue_near_green = (blue - red) * slope + 120.0
     hue_near_red = (green - blue) * slope
     hue_not_near_red = torch.where(value == green, hue_near_green, hue_near_blue)
+    # If several channels have the largest value, red precedes green, and green precedes blue.
     angle = torch.where(value == red, hue_near_red, hue_not_near_red)
     angle = torch.where(angle < 0, angle + 360.0, angle) + hue  # degrees
     # Back to BGR:
@@ -252,7 +257,7 @@ def distort_images(images: Tensor, numbers: Tensor) -> Tensor:
         channels.append(value - chroma * weight)
     distorted = torch.stack(channels, dim=1) * late_contrast[:, None]
     height, width = images.shape[2:]
-    order = numbers[:, 5:].long()[:, :, None, None]  # (N, 3, 1, 1)
+    order = numbers[:, 5:].long()[:, :, None, None]  # input channel of each output (N, 3, 1, 1)
     return distorted.gather(1, order.expand(-1, -1, height, width))
 
 
@@ -279,6 +284,8 @@ class DistortImages(PhotoMetricDistortion3D):
         numbers = []
         for _ in results["img"]:
             image_numbers = list(self._random_flags())
+            # The flag is cleared after all numbers are drawn, so that later images get equal random
+            # numbers with and without the permutation.
             if not self.swap_channels:
                 image_numbers[self._SWAP_FLAG] = 0
             numbers.append(tuple(image_numbers))

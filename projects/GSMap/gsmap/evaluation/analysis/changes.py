@@ -106,12 +106,12 @@ def with_map_names(
         All changes, in their order.
 
     Raises:
-        ValueError: If a change has no name of a map and there are several maps.
+        ValueError: If a change has no name of a map and there are several maps, or none.
     """
     named = []
     for change in changes:
         if not change.map_name:
-            if len(map_names) > 1:
+            if len(map_names) != 1:
                 raise InputError(
                     f"{where} has changes without the property `map`, and the annotation file has "
                     f"{len(map_names)} maps: name one for each change."

@@ -1,8 +1,9 @@
 """Reading and writing of results and ground truth in the JSON form of MapTR's evaluator.
 
 A file of results is ``{"meta": ..., "results": [{"sample_token", "vectors": [{"pts", "pts_num",
-"cls_name", "type", "confidence_level"}]}]}``. A file of ground truth is ``{"GTs": [...]}``, without
-confidence.
+"cls_name", "type", "confidence_level"}]}]}``. A vector is a map element: its points in metres,
+their number, the name and the label of its class, and its score. A file of ground truth is
+``{"GTs": [...]}``, without confidence.
 """
 
 import heapq
@@ -30,8 +31,8 @@ BEZIER = "bezier"
 THREE_D = "3D"
 """Key of the number of samples with heights in `SampleFile.ignored`."""
 SHARD_KIND = "results"
-_LAST_LINE = "]}\n"
-_GAUSSIAN_FIELDS = ("scales", "rotations")
+_LAST_LINE = "]}\n"  # closes the list of samples and the object of the file
+_GAUSSIAN_FIELDS = ("scales", "rotations")  # of `MapElements`; ``gaussian_<field>`` in a vector
 
 
 def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, Any]]:
@@ -54,11 +55,11 @@ def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, 
         }
         vectors.append(vector)
     for name in _GAUSSIAN_FIELDS:
-        values = getattr(elements, name)
-        if values is None:
+        vertex_values = getattr(elements, name)  # one row for each vertex of all elements
+        if vertex_values is None:
             continue
         for vector, (start, end) in zip(vectors, pairwise(elements.offsets), strict=True):
-            vector[f"gaussian_{name}"] = values[start:end].tolist()
+            vector[f"gaussian_{name}"] = vertex_values[start:end].tolist()
     return vectors
 
 
@@ -89,7 +90,10 @@ class SampleFile:
         self.about: dict[str, Any] = {}
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, Place]]:
-        """Yield token, elements and place of each sample; raises the errors of `raw`."""
+        """Yield token, elements and place of each sample; raises the errors of `raw`.
+
+        The place is the start and the length of the sample in the file, in bytes.
+        """
         for _, token, elements, place in self.raw():
             yield token, elements, place
 
@@ -103,7 +107,8 @@ class SampleFile:
         """
         tokens = set()
         form = f'{{"{self._key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}'
-        other_entries: dict[str, Any] = {"meta": None}  # `items_of` fills it
+        # `items_of` sets the value of this key when it reaches the entry, which may come last.
+        other_entries: dict[str, Any] = {"meta": None}
         for item, place in items_of(self.path, self._key, f"it must be {form}", other_entries):
             token, elements = self._convert(item, self.ignored)
             if token in tokens:
@@ -115,6 +120,7 @@ class SampleFile:
 
     def tokens(self) -> list[str]:
         """Return the tokens of all samples."""
+        # Another object, so that the counts in `ignored` do not change.
         file = SampleFile(self.path, key=self._key, classes=self._classes)
         return [token for token, _, _ in file]
 
@@ -126,6 +132,7 @@ class SampleFile:
             place: Place of the sample, as iterating yields it: start and length in bytes.
 
         Raises:
+            FileNotFoundError: If the file does not exist.
             ValueError: If the sample is not in this place.
         """
         start, length = place
@@ -199,6 +206,7 @@ def read_vectors(
         labels.append(label_of.get(name, -1))
         points = _points_of(vector)
         polylines.append(points)
+        # One element with heights (x, y, z) is enough.
         has_heights |= len(points) > 0 and len(points[0]) == 3
         if scored:
             scores.append(vector["confidence_level"])
@@ -244,6 +252,7 @@ def _check_lengths(elements: MapElements) -> None:
     first_vertices = starts[starts < len(steps)]  # lines without vertices may be at the end
     steps[first_vertices] = 0.0
     total = steps.sum()
+    # No single line is too long if all lines together are not.
     if max_coordinate > MAX_LENGTH_M or total > MAX_LENGTH_M:
         lengths = [steps[start:end].sum() for start, end in pairwise(elements.offsets)]
         worst = max([max_coordinate, *lengths])
@@ -283,7 +292,9 @@ def read_leading_meta(path: Path, key: str) -> dict[str, Any]:
         FileNotFoundError: If the file does not exist.
         ValueError: If the file has no list under the key.
     """
-    other_entries: dict[str, Any] = {"meta": None}  # `items_of` fills it
+    # `items_of` sets the value of this key if the entry precedes the first sample. Then the file is
+    # closed, and no further sample is read.
+    other_entries: dict[str, Any] = {"meta": None}
     advice = f'it must be {{"{key}": [...]}}'
     with closing(items_of(path, key, advice, other_entries)) as items:
         next(items, None)
@@ -325,6 +336,8 @@ def write_results(
         key: Key of the samples: ``results`` or ``GTs``.
     """
     meta_text = json.dumps(dict(meta or {}))
+    # `merge_results` relies on these lines: first the metadata and the key, then one line per
+    # sample, and `_LAST_LINE`.
     with atomic_write(path) as file:
         file.write(f'{{"meta":{meta_text},"{key}":[')
         for number, (token, vectors) in enumerate(samples):
@@ -337,6 +350,9 @@ def write_results(
 def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
     """Write a result file from its shards, with the samples in the order of their tokens.
 
+    A shard is the result file of a part of the samples. The lines of the samples are copied as
+    text.
+
     Args:
         path: Path of the result file.
         shards: Shards, as ``find_shards`` returns them.
@@ -348,7 +364,7 @@ def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
         ValueError: If the metadata of the shards differs, a sample occurs twice, or the samples of
             a shard are not in the order of their tokens.
     """
-    with ExitStack() as stack, atomic_write(path) as out:
+    with ExitStack() as stack, atomic_write(path) as out:  # the stack closes the shards at the end
         files = []
         for shard in shards:
             file = shard.path.open(encoding="utf-8")
@@ -359,27 +375,30 @@ def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
             raise InputError(f"the shards of {path} have different first lines: create them again.")
         out.write(head.removesuffix("\n"))
         count = 0
-        last = None
+        last_token = None
         sorted_lines = [_lines_by_token(file) for file in files]  # each in the order of tokens
-        for token, line in heapq.merge(*sorted_lines):
-            if last is not None and token <= last:
+        for token, line in heapq.merge(*sorted_lines):  # keeps this order over all files
+            if last_token is not None and token <= last_token:
                 raise InputError(f"shards of {path} hold sample {token!r} twice or out of order.")
             out.write(",\n" if count else "\n")
             out.write(line)
             count += 1
-            last = token
+            last_token = token
         out.write("\n" + _LAST_LINE)
     return count
 
 
 def _lines_by_token(file: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yield token and text of each sample, from the lines that ``write_results`` writes."""
+    """Yield token and text of each sample, from the lines that ``write_results`` writes.
+
+    The text is one JSON object, without the comma and the line break at its end.
+    """
     decoder = json.JSONDecoder()
     start = len('{"sample_token":')
     for line in file:
         if line == _LAST_LINE:
             continue
-        token, _ = decoder.raw_decode(line, start)
+        token, _ = decoder.raw_decode(line, start)  # the value at this position of the line
         if not isinstance(token, str):
             raise InputError(f"{token!r:.80} is no token of a sample.")
         yield token, line.rstrip(",\n")

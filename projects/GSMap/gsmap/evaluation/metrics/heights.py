@@ -25,13 +25,18 @@ from gsmap.structures.polylines import resample_all
 class Heights(Metric):
     """Errors of the heights of predictions that match in the plane, at the largest threshold.
 
-    The height of each point of a prediction is compared with the height of the point of its ground
-    truth that is nearest in the plane.
+    Predictions are matched with the ground truth as for AP_chamfer, by x and y only. The height of
+    each point of a prediction is then compared with the height of the point of its ground truth
+    that is nearest in the plane.
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        thresholds: Largest Chamfer distances of a match, in metres.
+        thresholds: Largest Chamfer distances of a match in metres, in any order. The matches at the
+            largest one are used.
         num_points: Number of points that each line is resampled to.
+
+    Raises:
+        ValueError: If ``classes`` are not valid names of classes.
     """
 
     name: ClassVar[str] = "heights"
@@ -57,8 +62,13 @@ class Heights(Metric):
     def match(self, sample: Sample) -> SampleValues:
         """Measure the matches of one sample.
 
+        Returns:
+            Class indices ``labels`` (M,) of the M matched predictions, and their ``errors`` in
+            metres (M, 2, P), which are the differences of heights and the distances in the plane.
+
         Raises:
-            ValueError: If a side has no heights.
+            ValueError: If the predictions or the ground truth have no heights, a label does not fit
+                the classes, or predictions have no scores.
         """
         token, predictions, truth = sample
         rules = ChamferConfig(
@@ -68,10 +78,11 @@ class Heights(Metric):
         pred_lines = self._resample(predictions)
         gt_lines = self._resample(truth)
         matched_gt = matches.matched_gt[:, -1]  # at the largest threshold; -1 without a match
-        rows = np.flatnonzero(matched_gt >= 0)
+        rows = np.flatnonzero(matched_gt >= 0)  # predictions with a match
         # The second axis has two entries: difference of heights, and distance in the plane.
         errors = np.empty((len(rows), 2, self.num_points))
         for index, row in enumerate(rows.tolist()):
+            # `matches` are sorted by score. `pred_index` gives the position among the predictions.
             pred = pred_lines[matches.pred_index[row]]
             gt = gt_lines[matched_gt[row]]
             distance = np.linalg.norm(pred[:, None, :2] - gt[None, :, :2], axis=-1)  # (P, P)
@@ -82,7 +93,7 @@ class Heights(Metric):
         return SampleValues(token, {"labels": matches.labels[rows], "errors": errors})
 
     def _resample(self, elements: MapElements) -> FloatArray:
-        """Resample the lines of one side in space. (N, P, 3)"""
+        """Resample the lines of the predictions or of the ground truth in space. (N, P, 3)"""
         points = elements.with_coordinates(3).points
         return resample_all(points, elements.offsets, num_points=self.num_points)
 
@@ -90,12 +101,15 @@ class Heights(Metric):
         """Compute the means over the matches of all samples.
 
         The keys of figures are ``CLASS/NAME``. ``height_error_m`` is the mean absolute difference
-        of heights, ``height_bias_m`` the mean difference (> 0 if predictions are too high),
-        ``plane_error_m`` the mean distance in the plane, each -1 without matches. ``num_matches``
-        is the number of matches.
+        of heights. ``height_bias_m`` is the mean difference, > 0 if predictions are too high.
+        ``plane_error_m`` is the mean distance in the plane. These three are -1 for a class without
+        matches. ``num_matches`` is the number of matches.
 
         Args:
-            table: Values of all samples.
+            table: Values of all samples, from `match`.
+
+        Returns:
+            One report with the figures of all classes.
         """
         labels = np.concatenate(table.column("labels"))
         errors = np.concatenate(table.column("errors"))  # (matches, 2, P)

@@ -273,7 +273,7 @@ class MultiLevelAttention(SamplingAttention):
         # Axis 3 has the samples of all maps; each map gets its group of them.
         all_offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)
         all_weights = self.weights(query).chunk(self.num_parts, 3)
-        total = torch.zeros_like(query)
+        total = query.new_zeros((*query.shape[:2], self.value_proj.out_features))
         for level, offsets, weights in zip(feats, all_offsets, all_weights, strict=True):
             shape = (level.shape[-2], level.shape[-1])
             value = self.values(level.flatten(2).transpose(1, 2))

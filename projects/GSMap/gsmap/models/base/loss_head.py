@@ -1,4 +1,7 @@
-"""Matching and losses of the predictions of all decoder layers and query groups."""
+"""Matching and losses of the predictions of all decoder layers and query groups.
+
+Costs and losses are computed in float32, so autocast is disabled around them.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
@@ -53,8 +56,8 @@ class LossHead(DetectionHead):
 
         This method prepares the ground truth and calls `losses_by_feat`.
 
-        Names of losses have the prefix ``d<layer>.`` in all layers but the last, and the name of
-        the group as suffix in all groups but the first.
+        Names of losses are ``loss_<name>``. They have the prefix ``d<layer>.`` in all layers but
+        the last, and the name of the group as suffix in all groups but the first.
 
         Args:
             outputs: Predictions of each layer, of all query groups.
@@ -94,10 +97,11 @@ class LossHead(DetectionHead):
         losses: Tensors = {}
         with torch.autocast(outputs[-1].scores.device.type, enabled=False):
             for group, layers in self.split_groups(outputs):
+                # Pairs of a query and its ground truth, of all layers.
                 pairs = self.match(layers, truths, metas=metas, repeats=group.repeats)
                 if group is self.query_groups[0]:
                     for hook in hooks:
-                        hook.targets(self, pairs.layer(-1))
+                        hook.targets(self, pairs.layer(-1))  # only the last layer
                 losses.update(self.group_losses(group, pairs))
         return losses
 
@@ -122,7 +126,8 @@ class LossHead(DetectionHead):
         Returns:
             Scalars by name.
         """
-        # The slice selects all queries; `of_queries` converts their scores to float32.
+        # The slice selects all queries. `of_queries` is called because it converts the scores to
+        # float32. `join` concatenates the queries of all layers.
         predictions = Predictions.join([layer.of_queries(slice(None)) for layer in layers])
         with torch.autocast(predictions.scores.device.type, enabled=False):
             known_matches = self.assigner.assign_known(predictions, truths, pairs=matches)
@@ -132,7 +137,10 @@ class LossHead(DetectionHead):
     def split_groups(
         self, outputs: Sequence[Predictions]
     ) -> Iterator[tuple[QueryGroup, list[Predictions]]]:
-        """Yield each query group with its predictions of each layer."""
+        """Yield each query group with its predictions of each layer.
+
+        The queries of the groups follow each other in the order of ``query_groups``.
+        """
         start = 0
         for group in self.query_groups:
             queries = slice(start, start + group.num)
@@ -158,6 +166,12 @@ class LossHead(DetectionHead):
             truths: Ground truth of the batch.
             metas: Meta dict of each sample.
             repeats: Number of queries to which each ground truth is matched.
+
+        Returns:
+            The pairs of all layers.
+
+        Raises:
+            FloatingPointError: If a matching cost is not finite.
         """
         predictions = Predictions.join(layers)
         matches = self.assigner.assign(predictions, truths, metas=metas, repeats=repeats)
@@ -173,7 +187,7 @@ class LossHead(DetectionHead):
             truths: Ground truth of the batch.
             matches: Indices of the pairs.
         """
-        count = float(sum(matches.counts))
+        count = float(sum(matches.counts))  # pairs of one layer; all layers have equally many
         num_pairs = torch.full((), count, device=predictions.scores.device)
         avg_factor = reduce_mean(num_pairs).clamp(min=1.0)
         return MatchedPairs(predictions, truths, matches=matches, avg_factor=avg_factor)
@@ -188,8 +202,10 @@ class LossHead(DetectionHead):
         Returns:
             Scalars by name.
         """
+        # Losses of each layer, by name.
         layer_losses: list[Tensors] = [{} for _ in range(pairs.num_layers)]
         is_first = group is self.query_groups[0]
+        # A group may use only some of the losses. "cls" is the name of `loss_cls`.
         names = ("cls", *self.losses) if group.losses is None else group.losses
         if "cls" in names:
             for index, value in enumerate(self.class_losses(pairs)):
@@ -203,10 +219,10 @@ class LossHead(DetectionHead):
             layer_losses[-1].update(self.statistics(pairs.layer(-1)))
         suffix = f"_{group.name}" if group.name else ""
         losses = {}
-        for index, values in enumerate(layer_losses):
+        for index, named_values in enumerate(layer_losses):
             is_last = index == pairs.num_layers - 1
             prefix = "" if is_last else f"d{index}."
-            for name, value in values.items():
+            for name, value in named_values.items():
                 losses[f"{prefix}{name}{suffix}"] = value
         return losses
 
@@ -221,11 +237,12 @@ class LossHead(DetectionHead):
         return {index: loss(pairs.layer(index)) for index in layers_with_loss}
 
     def class_losses(self, pairs: MatchedPairs) -> Tensor:
-        """Classification loss of each layer. (L,)"""
+        """Classification loss of each layer, divided by the number of pairs. (L,)"""
         scores = pairs.predictions.scores  # (B, L * N, classes)
-        if isinstance(self.loss_cls, ClassLoss):
+        # Both kinds of loss give one value for each logit. (B, L * N, classes)
+        if isinstance(self.loss_cls, ClassLoss):  # reads the matched pairs
             values = self.loss_cls(pairs)
-        else:
+        else:  # a loss of mmdet, which reads logits and labels
             values = plain_class_loss(self.loss_cls, scores, labels=pairs.query_labels())
         # (B, L * N, classes) -> (L, B, N * classes)
         by_layer = values.view(len(scores), pairs.num_layers, -1).transpose(0, 1)

@@ -1,4 +1,8 @@
-"""Projection of BEV pillars into the cameras, and of feature pixels to points in 3D."""
+"""Projection of BEV pillars into the cameras, and of feature pixels to points in 3D.
+
+A pillar is a column of points over a BEV cell. All points are in the annotation frame. The padded
+image is the input of the backbone, whose sides are rounded up to multiples of a divisor.
+"""
 
 from typing import NamedTuple
 
@@ -9,7 +13,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
 
-_MIN_DEPTH_M = 1e-5
+_MIN_DEPTH_M = 1e-5  # points that are nearer to the camera plane are not visible
 
 
 class PillarProjection(NamedTuple):
@@ -61,10 +65,11 @@ def project_pillars(
         img_from_frame: Matrices from metres to (u * d, v * d, d, 1) in pixels. (B, V, 4, 4)
         img_shape: Rows and columns of the padded image.
     """
-    matrices = img_from_frame[:, :, None, None].float()
+    matrices = img_from_frame[:, :, None, None].float()  # (B, V, 1, 1, 4, 4), for all Q and Z
     x, y, z, _ = points.float()[..., None].unbind(-2)  # (Q, Z, 1) each
     # The product is written out. On a GPU, a product of millions of small matrices takes ten times
     # as long, and TF32 would move the projections by pixels.
+    # `matrices[..., j]` is column j. The coordinate 1 of the points leaves column 3 as it is.
     projected = matrices[..., 0] * x + matrices[..., 1] * y + matrices[..., 2] * z
     return visible_points(projected + matrices[..., 3], img_shape)
 
@@ -79,7 +84,7 @@ def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProje
     """
     depth = projected[..., 2]
     uv = projected[..., :2] / depth.clamp(min=_MIN_DEPTH_M)[..., None]
-    uv = uv / constant(uv, [img_shape[1], img_shape[0]])
+    uv = uv / constant(uv, [img_shape[1], img_shape[0]])  # a cached tensor (width, height)
     inside = (depth > _MIN_DEPTH_M) & ((uv > 0) & (uv < 1)).all(-1)
     return PillarProjection(uv, inside.any(-1))
 
@@ -90,8 +95,9 @@ def pixel_rays(
     """Viewing rays of the feature pixels, as vectors from the camera to the depth of 1 m.
 
     Args:
-        frame_from_img: Inverse projections as in `frustum_points`, of which the first three rows
-            and columns are used. (..., 3 or 4, 3 or 4)
+        frame_from_img: Inverse projections, which map (u * d, v * d, d, 1) to (x, y, z, 1) in
+            metres as in `frustum_points`. Only the first three rows and columns are used.
+            (..., 3 or 4, 3 or 4)
         image_size: Height and width of the padded image in pixels.
         feature_size: Height h and width w of the feature map.
 

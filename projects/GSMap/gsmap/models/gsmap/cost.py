@@ -32,7 +32,7 @@ class IoUCost(MapCost):
         self.kind = kind
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if the head has no Gaussians."""
+        """Raise ValueError if the head has no Gaussians, of which masks are rendered."""
         require_gaussians(self, head)
 
     def __call__(
@@ -43,12 +43,14 @@ class IoUCost(MapCost):
         Args:
             pred_instances: Predictions of a sample, with ``cost_masks``, their masks at the lower
                 resolution of matching. (N, h, w)
-            gt_instances: Ground truth of the sample, with ``cost_masks``. (K, h, w)
+            gt_instances: Ground truth of the sample, with ``cost_masks`` (K, h, w), their masks at
+                this resolution, and class indices ``labels`` (K,).
             img_meta: Meta dict of the sample, not used.
 
         Returns:
             The costs. (N, K)
         """
+        # One weight for all, (), or a weight for each ground truth, (K,): both broadcast to (N, K).
         weights = class_weights(self.weight, gt_instances.labels)
         preds = pred_instances.cost_masks
         targets = gt_instances.cost_masks

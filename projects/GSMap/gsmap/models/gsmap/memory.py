@@ -1,6 +1,10 @@
 """Memory of Gaussians: transformation to the next frame, refinement, and fusion.
 
 The memory of Gaussians is not in the paper. The published memory of queries propagates points.
+
+A reference encodes a point or a Gaussian as D numbers: the centre, [0, 1] over the map, possibly a
+height, and for a Gaussian two sigmas and the angle theta before their activation. ``decode`` of the
+reference space returns Gaussians in metres, and ``encode`` is its inverse.
 """
 
 import math
@@ -17,7 +21,7 @@ from gsmap.structures.gaussians import fuse_gaussians, move_gaussians
 from gsmap.structures.past import Past
 from gsmap.utils.errors import InputError
 
-COVARIANCES = ("points", "moved", "fused")
+COVARIANCES = ("points", "moved", "fused")  # values of ``covariance``, see `GaussianMemory`
 
 
 @MODELS.register_module()
@@ -73,21 +77,23 @@ class GaussianMemory(QueryMemory):
         Returns:
             References of the current frame. (B, K, P, D)
         """
-        points = super().transform_references(head, references, past)
+        transformed = super().transform_references(head, references, past)
         if self.covariance == "points":
             # Zeros encode the sigmas and theta of the initial Gaussian of a query.
-            initial_gaussians = torch.zeros_like(points[..., -3:])
-            return torch.cat([points[..., :-3], initial_gaussians], dim=-1)
+            initial_gaussians = torch.zeros_like(transformed[..., -3:])
+            return torch.cat([transformed[..., :-3], initial_gaussians], dim=-1)
         space = require_gaussians(self, head).space
-        scale = past.seconds.sqrt()
-        with torch.autocast(points.device.type, enabled=False):
+        # The variance grows linearly with time, so the standard deviation grows with its root. (B,)
+        sqrt_seconds = past.seconds.sqrt()
+        with torch.autocast(transformed.device.type, enabled=False):
             gaussians = move_gaussians(
                 space.decode(references),
                 motion=past.now_from_then,
-                drift_m=self.noise_m * scale,
-                drift_rad=self.noise_rad * scale,
+                drift_m=self.noise_m * sqrt_seconds,
+                drift_rad=self.noise_rad * sqrt_seconds,
             )
-            return space.encode(gaussians, points)
+            # The heights are taken from the second argument.
+            return space.encode(gaussians, transformed)
 
     def fuse_references(self, refined: Tensor, transformed: Tensor, head: FlowHead) -> Tensor:
         """Fuse refined Gaussians with the transformed ones, if their centres are on the map.
@@ -105,8 +111,9 @@ class GaussianMemory(QueryMemory):
         space = require_gaussians(self, head).space
         with torch.autocast(refined.device.type, enabled=False):
             gaussians = fuse_gaussians(space.decode(transformed), space.decode(refined))
-            fused = space.encode(gaussians, refined)
-        # Centres outside of the map have been moved to its border, away from the element.
+            fused = space.encode(gaussians, refined)  # with the heights of `refined`
+        # `transform_references` has moved centres outside of the map to its border, away from the
+        # element. These are not fused.
         distances = (transformed[..., :2] - 0.5).abs()  # distances from the middle of the map
         inside = distances.amax(-1, keepdim=True) < 0.5
         return torch.where(inside, fused, refined)

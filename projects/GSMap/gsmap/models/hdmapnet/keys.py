@@ -1,8 +1,9 @@
 """Mapping between the state keys of the released HDMapNet and of this project.
 
 `rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
-Each word of the text continues both prefixes: ``released=here``, or one name for both. `zeros`
-lists keys of the release that have no effect there, and no counterpart here.
+Each word of the text continues both prefixes: ``released=here``, or one name for both. ``{i}``
+stands for a number. `zeros` lists keys of the release that have no effect there and no counterpart
+here. Conversion to the release writes zeros of the listed shapes under these keys.
 """
 
 from gsmap.checkpoints.efficientnet_keys import (
@@ -21,9 +22,9 @@ _VIEWS = "view_fusion.hw_mat."
 HDMAPNET = KeyMap(
     "hdmapnet",
     (
-        *efficientnet_rules(_TRUNK, "img_backbone."),
+        *efficientnet_rules(_TRUNK, "img_backbone."),  # the keys of the EfficientNet-B0
         ("camencode.up1.conv.", "img_neck.joined."),
-        (f"{_VIEWS}{{i}}.", "bev_encoder.views.{i}."),
+        (f"{_VIEWS}{{i}}.", "bev_encoder.views.{i}."),  # {{i}} is {i} in an f-string
         *rules_of(
             _BEV,
             _OURS,
@@ -35,7 +36,7 @@ HDMAPNET = KeyMap(
         ),
     ),
     unused={
-        **unused_classifier(_TRUNK),
+        **unused_classifier(_TRUNK),  # the classifier of the EfficientNet-B0
         # The release has a first block for the directions, but never calls it and uses the block of
         # the embeddings instead. Conversion to the release writes zeros of these shapes.
         **zeros(

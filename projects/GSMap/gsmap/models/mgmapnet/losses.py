@@ -15,7 +15,7 @@ from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape
 from gsmap.utils.errors import InputError
 
-PAIRINGS = ("matched", "released")
+PAIRINGS = ("matched", "released")  # values of ``pairing`` of `InstanceMaskLoss`
 
 
 def instance_mask_losses(
@@ -26,7 +26,8 @@ def instance_mask_losses(
     Args:
         logits: Logits of the masks. (M, H, W)
         targets: Target masks in [0, 1], of any type. (M, H, W)
-        avg_factor: Divisor of the sum over the instances.
+        avg_factor: Divisor of the sum over the instances: the number of matches, averaged over the
+            ranks, at least 1.
 
     Returns:
         Cross-entropy, averaged over the cells of an instance, and dice loss; 0 without matches.
@@ -54,8 +55,8 @@ class InstanceMaskLoss(MapLoss):
         pairing: ``"matched"`` compares each query with the mask of its ground truth.
             ``"released"`` compares the i-th matched query with the i-th ground truth, as in the
             released code. This is correct only if the matched ground truths happen to be sorted.
-        last_layer_only: Flag of `MapLoss`.
-        first_group_only: Flag of `MapLoss`.
+        last_layer_only: Whether the loss is computed for the last decoder layer only.
+        first_group_only: Whether the loss is computed for the first query group only.
 
     Raises:
         ValueError: If ``pairing`` is unknown.
@@ -87,15 +88,16 @@ class InstanceMaskLoss(MapLoss):
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Compute the weighted loss of masks at the resolution of the BEV features."""
+        # The M pairs are sorted by sample. `counts` is the number of pairs of each sample.
         sample_states = pairs.pred_instance_states.split(pairs.counts)
         sample_logits = []
         for states, feats in zip(sample_states, pairs.predictions.bev_feats, strict=True):
             sample_logits.append(self.logits(states, feats))
         logits = torch.cat(sample_logits)  # (M, H, W)
-        masks = pairs.gt_masks.to(logits)
+        masks = pairs.gt_masks.to(logits)  # the mask of the ground truth of each pair
         if self.pairing == "released":
             sample_masks = masks.split(pairs.counts)
-            sample_indices = pairs.gt_inds.split(pairs.counts)
+            sample_indices = pairs.gt_inds.split(pairs.counts)  # of the ground truth in its sample
             sorted_masks = []
             for matched_masks, indices in zip(sample_masks, sample_indices, strict=True):
                 # Masks in the order of the ground truth, while queries keep their order.
@@ -115,7 +117,7 @@ class SamplingLocationLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss.
-        flags: Flags of `MapLoss`.
+        flags: Flags of `MapLoss`, ``last_layer_only`` and ``first_group_only``.
     """
 
     name = "mean_loc"

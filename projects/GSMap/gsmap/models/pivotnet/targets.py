@@ -1,4 +1,4 @@
-"""PivotNet's targets: the pivots and the mask of every line."""
+"""PivotNet's targets: the pivots (vertices that determine the shape) and the mask of every line."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ def significances(points: Points) -> NDArray[np.float64]:
     """
     areas = np.full(len(points), fill_value=np.inf)
     areas[1:-1] = _triangle_areas(points[:-2], points[1:-1], points[2:])
-    remaining = list(range(len(points)))
+    remaining = list(range(len(points)))  # indices of the points that are not removed yet
     # Position of a neighbour of the removed point that is not more significant and is therefore
     # removed next. It is 0 if there is no such neighbour (0 is an end, which is never removed).
     next_position = 0
@@ -103,13 +103,15 @@ class FormatPivotTargets(FormatLineTargets):
         Returns:
             Pivots (from the front, from the left) in [0, 1]. (m, 2)
         """
+        # Size of the map along the direction of travel and across it, from the number of pixels.
         size_m = np.array(front_size(grid)) * self.pixel_m
-        largest = self.num_points[label]
-        # Ends are level if their distances from the front differ by up to 1 m.
+        max_pivots = self.num_points[label]
+        # The line is directed from its rear end to its front end, or from right to left if its ends
+        # are level. Ends are level if their distances from the front differ by up to 1 m.
         line_m = orient_line(line * size_m, tolerance=1.0, sort_rings=self.sort_rings)
         areas = significances(line_m)
         pivots = np.flatnonzero(areas >= self.min_area_m2)
-        if self.keep_end and len(pivots) > largest:
-            most_significant = np.argsort(-areas, kind="stable")[:largest]
+        if self.keep_end and len(pivots) > max_pivots:
+            most_significant = np.argsort(-areas, kind="stable")[:max_pivots]
             pivots = np.sort(most_significant)
-        return line_m[pivots[:largest]] / size_m
+        return line_m[pivots[:max_pivots]] / size_m

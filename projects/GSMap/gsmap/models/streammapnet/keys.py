@@ -1,7 +1,9 @@
 """Mapping between the state keys of the released StreamMapNet and of this project.
 
 `rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
-Each word of the text continues both prefixes: ``released=here``, or one name for both.
+Each word of the text continues both prefixes: ``released=here``, or one name for both. A rule
+replaces the beginning of a key, so most names end with a dot. ``{i}`` stands for the index of a
+layer. The first rule that matches a key is applied.
 """
 
 import torch
@@ -13,6 +15,7 @@ _BACKBONE = "backbone."
 _INPUT = "head.input_proj."
 _ENCODER = "backbone.transformer.encoder.layers.{i}."
 _DECODER = "head.transformer.decoder.layers.{i}."
+# Coordinates of the 50 x 100 cells of the released map, in metres; row 0 has the largest y.
 _Y, _X = torch.meshgrid(
     torch.linspace(15.0, -15.0, 50), torch.linspace(-30.0, 30.0, 100), indexing="ij"
 )
@@ -40,9 +43,10 @@ STREAMMAPNET = KeyMap(
         ("head.query_update.fc.", "temporal.queries.fc."),
         ("stream_fusion_neck.", "temporal.bev."),
     ),
-    # Released keys without a counterpart here: cells, size and corner of the map, which are
-    # settings of a config.
+    # Released keys without a counterpart here, because the cells, the size and the corner of the
+    # map are settings of a config. A conversion to the released format writes these values.
     unused={
+        # Homogeneous coordinates (x, y, 0, 1) of the cells. (50, 100, 4)
         "plane": torch.stack([_X, _Y, torch.zeros_like(_X), torch.ones_like(_X)], -1),
         "head.roi_size": torch.tensor((60.0, 30.0)),
         "head.origin": torch.tensor((-30.0, -15.0)),
@@ -53,4 +57,4 @@ STREAMMAPNET = KeyMap(
     upstream_prefix=_INPUT,
 )
 
-KEY_MAPS = (STREAMMAPNET,)
+KEY_MAPS = (STREAMMAPNET,)  # read by `gsmap.checkpoints.key_map`

@@ -111,7 +111,7 @@ class BEVMemory(nn.Module, AddsWeights):
         rotation = motion[:, :2, :2].transpose(1, 2)
         previous = cells.flatten(0, 1) @ rotation + motion[:, None, :2, 3]
         norm = self.grid.norm_from_metres(previous.unflatten(1, (height, width)))
-        return 2 * norm - 1
+        return 2 * norm - 1  # [0, 1] -> [-1, 1]
 
     def warp(self, memory: Tensor, motion: Tensor) -> Tensor:
         """Resample features of the previous frame at the cells of the current frame.
@@ -132,7 +132,8 @@ class BEVMemory(nn.Module, AddsWeights):
 
         Args:
             feats: BEV features of the current frame. (B, C, H, W)
-            past: Memory of the streams and the ego motion.
+            past: Memory of the streams, with the result of `remember` as ``bev_feats``, and the ego
+                motion.
 
         Returns:
             The fused features. (B, C, H, W)
@@ -151,6 +152,7 @@ class BEVMemory(nn.Module, AddsWeights):
             warped = self.warp(memory.to(feats), past.then_from_now)
             if self.kept_dims is not None:
                 warped = torch.cat([warped, hidden[:, self.kept_dims :]], dim=1)
+            # Streams that start keep the features of the current frame.
             hidden = torch.where(past.continues.view(-1, 1, 1, 1), warped, hidden)
         inputs = torch.cat([hidden, feats], dim=1)
         update = self.convz(inputs).sigmoid()
@@ -161,5 +163,8 @@ class BEVMemory(nn.Module, AddsWeights):
         return fused.permute(0, 3, 1, 2)
 
     def remember(self, fused: Tensor) -> Tensor:
-        """Memory for the next frame. (B, C, H, W) -> (B, kept_dims, H, W)"""
+        """Memory for the next frame. (B, C, H, W) -> (B, kept_dims, H, W)
+
+        If ``kept_dims`` is None, the memory has all C channels.
+        """
         return fused.detach()[:, : self.kept_dims]

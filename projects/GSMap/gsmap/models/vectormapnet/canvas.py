@@ -14,7 +14,8 @@ from gsmap.utils.errors import InputError
 class Canvas:
     """Raster of W x H pixels over the map and a margin at its upper edges.
 
-    The token of a coordinate is its pixel number plus one. Token 0 ends a sequence.
+    The token of a coordinate is its pixel number plus one. Token 0 ends a sequence. Points are
+    normalised to [0, 1] over the canvas: 0 is in the first pixel of an axis, and 1 in the last one.
 
     Args:
         grid: Extent of the map, in metres.
@@ -23,7 +24,7 @@ class Canvas:
         margin_m: Width in metres, >= 0, of the margin beyond the upper edges of the map.
 
     Raises:
-        ValueError: If the pixels do not divide the extent, or if the margin is negative.
+        ValueError: If the pixels do not divide the extent of the map, or if the margin is negative.
     """
 
     grid: BEVGrid
@@ -48,16 +49,20 @@ class Canvas:
 
     @property
     def num_tokens(self) -> int:
-        """Size of the vocabulary, shared by x and y."""
+        """Size of the vocabulary, shared by x and y: the pixels of the longer axis and token 0."""
         return max(self.size) + 1
 
     @property
     def settings(self) -> tuple[float, ...]:
-        """Settings that must be equal in the targets and in the head."""
+        """Settings that must be equal in the targets and in the head.
+
+        They are the pixel size, the margin, the range of x and the range of y, all in metres.
+        """
         return self.pixel_m, self.margin_m, *self.grid.x_range, *self.grid.y_range
 
     @cached_property
     def _grid_with_margin(self) -> BEVGrid:
+        """Extent of the canvas, which is the map with the margin at its upper edges."""
         x_low, x_high = self.grid.x_range
         y_low, y_high = self.grid.y_range
         return replace(
@@ -85,5 +90,5 @@ def tokenize_points(points: np.ndarray, steps: Sequence[int]) -> np.ndarray:
     Returns:
         Tokens, the last of which is 0. (2 n + 1,)
     """
-    pixels = (points * steps).astype(np.int64)
-    return np.append(pixels + 1, 0)
+    pixels = (points * steps).astype(np.int64)  # rounded down; (n, 2)
+    return np.append(pixels + 1, 0)  # `append` flattens the rows (x, y) to x, y, x, y, ...

@@ -1,7 +1,8 @@
 """Mapping between the state keys of the released VectorMapNet and of this project.
 
 The first two arguments of `rules_of` are the prefixes of keys in the release and here. The text
-lists the rest of each key, as ``released=here`` or as one name that both have.
+lists the rest of each key, as ``released=here`` or as one name that both have. ``{i}`` stands for a
+number. All entries are prefixes of keys, and most of them end with a dot.
 `zeros` lists keys of the release that have no effect there and no counterpart here. When weights
 are converted to the release, the values in ``unused`` are written; a key with None is not written.
 """
@@ -10,6 +11,8 @@ import torch
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 
+# Prefixes in the release: the detector of elements, and the generator of the vertices of their
+# lines.
 _ELEMENTS = "head.det_net."
 _ELEMENT_LAYER = "head.det_net.transformer.decoder.layers.{i}."
 _LINES = "head.gen_net."

@@ -2,9 +2,11 @@
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels: deformable sampling of a map, forward and backward in one launch each.
 
-A row is the output of one head of one query, with all channels of the head. A program (an instance
-of a kernel) computes as many rows as fit into ``BLOCK`` values. Sums are float32 for every dtype of
-the map. Cells outside of the map count as zero. A NaN location makes only its row NaN.
+A map is the flattened BEV or image features, which have H rows and W columns of cells. A row of the
+output is the result of one head of one query, with all channels of the head. A program (an instance
+of a kernel) computes as many rows of the output as fit into ``BLOCK`` values. Sums are float32 for
+every dtype of the map. Cells outside of the map count as zero. A NaN location makes only its row
+NaN.
 
 The gradient of the map is summed by atomic additions in any order, so repeated runs differ in the
 last bits. No launch waits for the device, and nothing is autotuned.
@@ -21,6 +23,14 @@ OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 @triton.jit
 def _locate_sample(locations, weights, sample, valid, height, width):
     """Locate a sample relative to the centres of the four cells around it.
+
+    Args:
+        locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
+        weights: Attention weights. (B, Q, heads, S)
+        sample: Flat index of the sample of each row. (ROWS,)
+        valid: Whether the row exists; otherwise, zeros are read. (ROWS,)
+        height: Number of rows of the map.
+        width: Number of columns of the map.
 
     Returns:
         Column and row of the upper left cell, distance of the sample from the centre of this cell
@@ -67,13 +77,14 @@ def _locate_rows(
         heads: Number of heads.
         cells: Number of cells of a map.
         C: Number of channels of a head.
-        CP: C rounded up to a power of two.
+        CP: C rounded up to a power of two, as Triton requires for the size of a block.
         ROWS: Number of rows of a program.
 
     Returns:
         Index of each row (ROWS,), whether the row exists (ROWS,), offset of the first value of its
         head in the maps (ROWS,), indices of the channels (CP,), and whether they exist (CP,).
     """
+    # 64 bits, because offsets in large maps exceed 32 bits.
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     batch = row // (queries * heads)
     head = row % heads
@@ -217,10 +228,11 @@ def backward_kernel(
             product = tl.sum(grad * pixel, axis=1)
             grad_weight += product * weight_x * weight_y
             slope_x = 1 if corner % 2 else -1  # derivative of weight_x
-            slope_y = 1 if corner // 2 else -1
+            slope_y = 1 if corner // 2 else -1  # derivative of weight_y
             grad_x += product * weight_y * slope_x
             grad_y += product * weight_x * slope_y
         tl.store(grad_weights + sample, grad_weight, mask=valid)
+        # The tensors of these gradients have one entry per sample, so no addition is needed.
         # Locations are shares of the map: a change by 1 is a change by `width` or `height` cells.
         tl.store(grad_locations + sample * 2, grad_x * weight * width, mask=valid)
         tl.store(grad_locations + sample * 2 + 1, grad_y * weight * height, mask=valid)
@@ -255,7 +267,7 @@ def deformable_sample(value, locations, weights, height, width):
     out = torch.empty(shape, dtype=torch.float32, device=value.device)
     if out.numel():
         rows, sizes, grid = _plan_launch(value, weights)
-        with torch.cuda.device_of(value):
+        with torch.cuda.device_of(value):  # Triton launches on the current device
             forward_kernel[grid](
                 value.contiguous(),
                 locations.contiguous(),
@@ -295,7 +307,7 @@ def deformable_sample_backward(grads, value, locations, weights, height, width):
     grad_locations = torch.empty_like(locations)
     grad_weights = torch.empty_like(weights)
     rows, sizes, grid = _plan_launch(value, weights)
-    with torch.cuda.device_of(value):
+    with torch.cuda.device_of(value):  # Triton launches on the current device
         backward_kernel[grid](
             grads.contiguous(),
             value.contiguous(),

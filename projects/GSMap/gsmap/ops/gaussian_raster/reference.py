@@ -42,6 +42,9 @@ def render_gaussians_reference(
 ) -> Tensor:
     r"""Render :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6) as ``-expm1(sum log1p(-G))``.
 
+    The product runs over the P Gaussians of an element. The sum of logarithms is more exact where
+    all densities are small.
+
     Args:
         means: Centres in metres, in the frame of ``grid``. (..., P, 2)
         scales: Standard deviations along the axes of each Gaussian, in metres, > 0. (..., P, 2)
@@ -53,4 +56,4 @@ def render_gaussians_reference(
     """
     densities = gaussian_densities(means, scales, rotations=rotations, grid=grid)
     densities = densities.clamp(max=MAX_DENSITY)
-    return -torch.expm1(torch.log1p(-densities).sum(-3))
+    return -torch.expm1(torch.log1p(-densities).sum(-3))  # the sum is over the P Gaussians

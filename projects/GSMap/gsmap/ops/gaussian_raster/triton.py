@@ -16,14 +16,16 @@ which is 1 - prod (1 - G) and exact for small G.
 
 The backward pass computes the transmittance T = prod (1 - G) of the tile again and reads dL/dR
 once. As dR/dG = T / (1 - G), it sums w u, w v, w u^2, w u v and w v^2 for each Gaussian that meets
-the tile, with w = dL/dR * T * G / (1 - G). Each program writes its sums to separate entries of a
-buffer (N, tiles, P, 5). There are no atomics, so repeated runs are bitwise equal. Torch adds the
-sums of all tiles and computes the gradients from them.
+the tile, with w = dL/dR * T * G / (1 - G). The five sums are called moments. Each program writes
+its moments to separate entries of a buffer (N, tiles, P, 5). There are no atomics, so repeated runs
+are bitwise equal. Torch adds the moments of all tiles and computes the gradients from them.
 
 No launch waits for the device, nothing is autotuned, and TILE is the only size that is a
 compile-time constant.
 
-There are two pairs of kernels. In the second pair (``warp_...``) a program is one warp with a
+There are two pairs of kernels, whose results are equal up to rounding. The first pair is the
+default. The second pair (``warp_...``) replaces it if the environment variable
+``GSMAP_TRITON_KERNELS`` contains ``render_gaussians_in_warps``. There a program is one warp with a
 smaller tile, and Gaussians that miss the tile are not visited: the boxes of 32 Gaussians are tested
 at once, one per lane, and the loop runs over the set bits of the result. The term of u and v in x
 is computed once per column, and the term in y once per row. Here u and v have the factor
@@ -38,8 +40,8 @@ import triton.language as tl
 
 from gsmap.ops.gaussian_raster.reference import SQUARED_REACH
 
-TILE = 32
-WARP_TILE = 16
+TILE = 32  # side of a tile of the first pair, in pixels
+WARP_TILE = 16  # side of a tile of the second pair, in pixels
 CHUNK = tl.constexpr(32)  # Gaussians whose boxes are tested at once: the bits of an integer
 POWER = math.sqrt(math.log2(math.e) / 2)  # exp(-x^2 / 2) = 2^-(POWER x)^2
 SIGMA = tl.constexpr(1 / POWER)  # brings sums of POWER u and POWER v back to units of sigma
@@ -73,7 +75,7 @@ def _touches(gaussian, left, right, low, high):
     is_beside = (mean_x + half_x < left) | (mean_x - half_x > right)
     misses = is_beside | (mean_y + half_y < low) | (mean_y - half_y > high)
     total = mean_x + mean_y + half_x + half_y  # NaN, which differs from itself, if one of them is
-    return (total != total) | (misses == 0)
+    return (total != total) | (misses == 0)  # `misses == 0` is "does not miss"
 
 
 @triton.jit
@@ -109,7 +111,7 @@ def forward_kernel(
         width: Columns W of the raster.
         TILE: Side of a tile in pixels.
     """
-    n = tl.program_id(1).to(tl.int64)
+    n = tl.program_id(1).to(tl.int64)  # instance; offsets into the buffers may exceed 32 bits
     tile = tl.program_id(0)
     x, y, index, valid = _tile_pixels(
         tile, x_min, y_min, step_x=step_x, step_y=step_y, height=height, width=width, TILE=TILE
@@ -120,7 +122,7 @@ def forward_kernel(
     high = tl.max(y)
     mask = tl.zeros((TILE, TILE), dtype=tl.float32)
     for p in range(count):
-        gaussian = gaussians + (n * count + p) * 8
+        gaussian = gaussians + (n * count + p) * 8  # 8 parameters per Gaussian
         if _touches(gaussian, left, right=right, low=low, high=high):
             density, _, _ = _density(gaussian, x, y=y)
             density = tl.where(density > MAX_DENSITY, MAX_DENSITY, density)
@@ -157,7 +159,7 @@ def backward_kernel(
         width: Columns W of the raster.
         TILE: Side of a tile in pixels.
     """
-    n = tl.program_id(1).to(tl.int64)
+    n = tl.program_id(1).to(tl.int64)  # instance; offsets into the buffers may exceed 32 bits
     tile = tl.program_id(0)
     x, y, index, valid = _tile_pixels(
         tile, x_min, y_min, step_x=step_x, step_y=step_y, height=height, width=width, TILE=TILE
@@ -166,19 +168,19 @@ def backward_kernel(
     right = tl.max(x)
     low = tl.min(y)
     high = tl.max(y)
-    trans = tl.full((TILE, TILE), 1.0, dtype=tl.float32)
+    trans = tl.full((TILE, TILE), 1.0, dtype=tl.float32)  # transmittance T
     for p in range(count):
-        gaussian = gaussians + (n * count + p) * 8
+        gaussian = gaussians + (n * count + p) * 8  # 8 parameters per Gaussian
         if _touches(gaussian, left, right=right, low=low, high=high):
             density, _, _ = _density(gaussian, x, y=y)
             trans *= 1 - tl.where(density > MAX_DENSITY, MAX_DENSITY, density)
     grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0) * trans  # dL/dR T
     out = moments + (n * tl.num_programs(0) + tile) * count * 5
     for p in range(count):
-        gaussian = gaussians + (n * count + p) * 8
+        gaussian = gaussians + (n * count + p) * 8  # 8 parameters per Gaussian
         if _touches(gaussian, left, right=right, low=low, high=high):
             density, u, v = _density(gaussian, x, y=y)
-            clamped = density > MAX_DENSITY  # no gradient
+            clamped = density > MAX_DENSITY  # constant there, so it has no gradient
             odds = density / tl.where(clamped, 1.0, 1 - density)
             weight = grad * tl.where(clamped, 0.0, odds)
             tl.store(out + p * 5, tl.sum(weight * u))
@@ -186,14 +188,18 @@ def backward_kernel(
             tl.store(out + p * 5 + 2, tl.sum(weight * u * u))
             tl.store(out + p * 5 + 3, tl.sum(weight * u * v))
             tl.store(out + p * 5 + 4, tl.sum(weight * v * v))
-        else:
+        else:  # the buffer is not initialised
             for i in range(5):
                 tl.store(out + p * 5 + i, 0.0)
 
 
 @triton.jit
 def _find_hits(gaussians, first, count, left, right, low, high):
-    """Integer whose bit i is set if the box of Gaussian ``first + i`` meets a tile, or is NaN."""
+    """Integer whose bit i is set if the box of Gaussian ``first + i`` meets a tile, or is NaN.
+
+    Bit 31 is the sign of the integer, which is therefore compared with 0 by ``!=``. ``gaussians``
+    points to the first Gaussian of the instance.
+    """
     lane = tl.arange(0, CHUNK)
     exists = first + lane < count
     box = gaussians + (first + lane) * 8
@@ -211,7 +217,8 @@ def _find_hits(gaussians, first, count, left, right, low, high):
 @triton.jit
 def _lowest_bit(bits):
     """Index of the lowest set bit, read from the exponent of a float."""
-    power = (bits & -bits).to(tl.uint32).to(tl.float32)  # the lowest bit alone, a power of two
+    # The lowest bit alone, a power of two. It is unsigned, since bit 31 is not a sign here.
+    power = (bits & -bits).to(tl.uint32).to(tl.float32)
     return (power.to(tl.int32, bitcast=True) >> 23) - 127  # 23 bits of mantissa, bias 127
 
 
@@ -246,7 +253,7 @@ def warp_forward_kernel(
         width: Columns W of the raster.
         TILE: Side of a tile in pixels.
     """
-    n = tl.program_id(1).to(tl.int64)
+    n = tl.program_id(1).to(tl.int64)  # instance; offsets into the buffers may exceed 32 bits
     tile = tl.program_id(0)
     x, y, index, valid = _tile_pixels(
         tile, x_min, y_min, step_x=step_x, step_y=step_y, height=height, width=width, TILE=TILE
@@ -298,7 +305,7 @@ def warp_backward_kernel(
         width: Columns W of the raster.
         TILE: Side of a tile in pixels.
     """
-    n = tl.program_id(1).to(tl.int64)
+    n = tl.program_id(1).to(tl.int64)  # instance; offsets into the buffers may exceed 32 bits
     tile = tl.program_id(0)
     x, y, index, valid = _tile_pixels(
         tile, x_min, y_min, step_x=step_x, step_y=step_y, height=height, width=width, TILE=TILE
@@ -308,21 +315,21 @@ def warp_backward_kernel(
     low = tl.min(y)
     high = tl.max(y)
     instance = gaussians + n * count * 8
-    trans = tl.full((TILE, TILE), 1.0, dtype=tl.float32)
+    trans = tl.full((TILE, TILE), 1.0, dtype=tl.float32)  # transmittance T
     for first in range(0, count, CHUNK):
         bits = _find_hits(instance, first, count=count, left=left, right=right, low=low, high=high)
         while bits != 0:
             p = first + _lowest_bit(bits)
             density, _, _ = _warp_density(instance + p * 8, x, y=y)
             trans *= 1 - tl.where(density > MAX_DENSITY, MAX_DENSITY, density)
-            bits = bits & (bits - 1)
-    grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0) * trans
+            bits = bits & (bits - 1)  # clears the lowest bit
+    grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0) * trans  # dL/dR T
     for first in range(0, count, CHUNK):
         bits = _find_hits(instance, first, count=count, left=left, right=right, low=low, high=high)
         while bits != 0:
             p = first + _lowest_bit(bits)
             density, u, v = _warp_density(instance + p * 8, x, y=y)
-            clamped = density > MAX_DENSITY  # no gradient
+            clamped = density > MAX_DENSITY  # constant there, so it has no gradient
             odds = density / tl.where(clamped, 1.0, 1 - density)
             weight = grad * tl.where(clamped, 0.0, odds)
             out = moments + ((n * tl.num_programs(0) + tile) * count + p) * 5
@@ -331,7 +338,7 @@ def warp_backward_kernel(
             tl.store(out + 2, tl.sum(weight * u * u) * (SIGMA * SIGMA))
             tl.store(out + 3, tl.sum(weight * u * v) * (SIGMA * SIGMA))
             tl.store(out + 4, tl.sum(weight * v * v) * (SIGMA * SIGMA))
-            bits = bits & (bits - 1)
+            bits = bits & (bits - 1)  # clears the lowest bit
 
 
 def _num_tiles(height, width, tile):
@@ -372,7 +379,7 @@ def render_gaussians(gaussians, frame, height, width):
     if not instances:
         return masks
     x_min, y_min, step_x, step_y = frame
-    with torch.cuda.device_of(gaussians):
+    with torch.cuda.device_of(gaussians):  # Triton launches on the current device
         forward_kernel[_num_tiles(height, width, tile=TILE), instances](
             _prepare(gaussians),
             masks,
@@ -409,7 +416,7 @@ def render_gaussians_backward(grads, gaussians, frame, height, width):
     moments = gaussians.new_empty(instances, num_tiles, count, 5)
     prepared = _prepare(gaussians)
     x_min, y_min, step_x, step_y = frame
-    with torch.cuda.device_of(gaussians):
+    with torch.cuda.device_of(gaussians):  # Triton launches on the current device
         backward_kernel[num_tiles, instances](
             prepared,
             grads.contiguous(),
@@ -454,8 +461,9 @@ def _gradients(moments, gaussians, prepared):
 def _warp_parameters(prepared):
     """Compute the parameters that the kernels in warps read. (N, P, 8) -> (N, P, 8)
 
-    They are mean x and y (0, 1), the direction (x, y) of u times POWER / sigma_u (2, 3), the
-    direction of v times POWER / sigma_v (4, 5), and half the width and height of the box (6, 7).
+    They are mean x and y (0, 1), the unit vector (x, y) along u times POWER / sigma_u (2, 3), the
+    unit vector along v times POWER / sigma_v (4, 5), and half the width and height of the bounding
+    box (6, 7).
     """
     means, cos, sin, inverse, box = prepared.split((2, 1, 1, 2, 2), -1)
     inv_u, inv_v = (POWER * inverse).split(1, -1)
@@ -479,7 +487,7 @@ def render_gaussians_in_warps(gaussians, frame, height, width):
     if not instances:
         return masks
     x_min, y_min, step_x, step_y = frame
-    with torch.cuda.device_of(gaussians):
+    with torch.cuda.device_of(gaussians):  # Triton launches on the current device
         warp_forward_kernel[_num_tiles(height, width, tile=WARP_TILE), instances](
             _warp_parameters(_prepare(gaussians)),
             masks,
@@ -513,10 +521,11 @@ def render_gaussians_in_warps_backward(grads, gaussians, frame, height, width):
     if not gaussians.numel():
         return (torch.zeros_like(gaussians),)
     num_tiles = _num_tiles(height, width, tile=WARP_TILE)
+    # Zeros, because the kernel writes nothing for Gaussians that miss a tile.
     moments = gaussians.new_zeros(instances, num_tiles, count, 5)
     prepared = _prepare(gaussians)
     x_min, y_min, step_x, step_y = frame
-    with torch.cuda.device_of(gaussians):
+    with torch.cuda.device_of(gaussians):  # Triton launches on the current device
         warp_backward_kernel[num_tiles, instances](
             _warp_parameters(prepared),
             grads.contiguous(),

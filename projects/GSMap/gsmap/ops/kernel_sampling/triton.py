@@ -2,10 +2,11 @@
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels that sum weighted pixels at fixed offsets from projected points, and gradients.
 
-The forward and the backward pass are one launch each. A row is the output of one head of one BEV
-cell, with all channels of the head. A program computes several neighbouring rows and loops over the
-cameras. If none of its cells is visible to a camera, a scalar branch skips the camera. Sums are
-float32 for every dtype of the feature maps.
+The pixels around one projected point are the sampling kernel of a BEV cell in GKT (Geometry-guided
+Kernel Transformer). The forward and the backward pass are one launch each. A row is the output of
+one head of one BEV cell, with all channels of the head. A program computes several neighbouring
+rows and loops over the cameras. If none of its cells is visible to a camera, a scalar branch skips
+the camera. Sums are float32 for every dtype of the feature maps.
 
 Multiplications and additions are not fused. Coordinates then have the rounding errors of plain
 torch, and are rounded to the pixels that plain torch selects. The gradient of the maps is added by
@@ -100,7 +101,7 @@ def forward_kernel(
         height: Rows h of a map.
         width: Columns w of a map.
         BILINEAR: Interpolate between pixels instead of rounding to one.
-        S: Number of pixels of a kernel.
+        S: Number of pixels (offsets) around a projection.
         C: Number of channels of a head.
         CP: C rounded up to a power of two.
         ROWS: Number of rows of a program.
@@ -133,6 +134,7 @@ def forward_kernel(
                     # Pixels around the point: 0 and 1 above, 2 and 3 below; 0 and 2 left, 1 and 3
                     # right.
                     for corner in tl.static_range(4):
+                        # Flat index of the pixel, and whether it lies on the map.
                         pixel_index, inside = find_corner(
                             left + corner % 2,
                             top + corner // 2,
@@ -199,7 +201,8 @@ def backward_kernel(
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
         grad_value: Output, float32, to which the gradient of the maps is added.
             (B, V, h * w, heads, C)
-        grad_uv: Output, filled with zeros, for the gradient of the points. (B, V, Q, heads, 2)
+        grad_uv: Output, filled with zeros, for the gradient of the projections. They remain zero
+            for invisible cells, and without ``BILINEAR``. (B, V, Q, heads, 2)
         grad_weights: Output for the gradient of the weights. (B, Q, heads, S)
         rows: Number of rows, B * Q * heads.
         queries: Number Q of BEV cells.
@@ -208,7 +211,7 @@ def backward_kernel(
         height: Rows h of a map.
         width: Columns w of a map.
         BILINEAR: Interpolate between pixels instead of rounding to one.
-        S: Number of pixels of a kernel (offsets).
+        S: Number of pixels (offsets) around a projection.
         SP: S rounded up to a power of two.
         C: Number of channels of a head.
         CP: C rounded up to a power of two.
@@ -220,7 +223,7 @@ def backward_kernel(
     is_channel = channel < C
     grad_pointers = grads + row[:, None] * C + channel[None, :]
     grad = tl.load(grad_pointers, mask=valid[:, None] & is_channel[None, :], other=0.0)
-    samples = tl.arange(0, SP)
+    offset_indices = tl.arange(0, SP)
     weight_grads = tl.zeros((ROWS, SP), dtype=tl.float32)
     for view in range(views):
         projection_index = (first_image + view) * queries + query
@@ -248,6 +251,7 @@ def backward_kernel(
                     # Pixels around the point: 0 and 1 above, 2 and 3 below; 0 and 2 left, 1 and 3
                     # right.
                     for corner in tl.static_range(4):
+                        # Flat index of the pixel, and whether it lies on the map.
                         pixel_index, inside = find_corner(
                             left + corner % 2,
                             top + corner // 2,
@@ -269,8 +273,8 @@ def backward_kernel(
                         )
                         product = tl.sum(grad * pixel, axis=1)
                         grad_weight += product * weight_x * weight_y
-                        slope_x = 1 if corner % 2 else -1  # derivative of weight_x
-                        slope_y = 1 if corner // 2 else -1
+                        slope_x = 1 if corner % 2 else -1  # derivative of weight_x by x
+                        slope_y = 1 if corner // 2 else -1  # derivative of weight_y by y
                         grad_x += product * weight * weight_y * slope_x
                         grad_y += product * weight * weight_x * slope_y
                 else:
@@ -285,23 +289,25 @@ def backward_kernel(
                     )
                     grad_weight += tl.sum(grad * pixel, axis=1)
                 # Add to column s by a mask, because a tensor in registers cannot be indexed.
-                weight_grads += tl.where(samples[None, :] == s, grad_weight[:, None], 0.0)
-            if BILINEAR:  # a rounded position has no gradient
+                weight_grads += tl.where(offset_indices[None, :] == s, grad_weight[:, None], 0.0)
+            # A rounded position has no gradient. The factors convert from pixels to [0, 1].
+            if BILINEAR:
                 tl.store(grad_uv + uv_offset, grad_x * width, mask=visible)
                 tl.store(grad_uv + uv_offset + 1, grad_y * height, mask=visible)
-    weight_pointers = grad_weights + row[:, None] * S + samples[None, :]
-    tl.store(weight_pointers, weight_grads, mask=valid[:, None] & (samples < S)[None, :])
+    weight_pointers = grad_weights + row[:, None] * S + offset_indices[None, :]
+    tl.store(weight_pointers, weight_grads, mask=valid[:, None] & (offset_indices < S)[None, :])
 
 
 def _plan_launch(value, weights):
     """Number of rows, sizes that are constants of the compiled kernel, and grid of the programs."""
-    batch, queries, heads, samples = weights.shape
+    batch, queries, heads, num_offsets = weights.shape
     channels = value.shape[4]
-    # At least 16, so that a program has at most BLOCK / 16 = 32 rows.
+    # A program computes BLOCK values: rows times padded channels. The channels are padded to at
+    # least 16, so that a program has at most BLOCK / 16 = 32 rows.
     padded_channels = max(16, triton.next_power_of_2(channels))
     rows_per_program = max(1, BLOCK // padded_channels)
     rows = batch * queries * heads
-    sizes = {"S": samples, "C": channels, "CP": padded_channels, "ROWS": rows_per_program}
+    sizes = {"S": num_offsets, "C": channels, "CP": padded_channels, "ROWS": rows_per_program}
     return rows, sizes, (triton.cdiv(rows, rows_per_program),)
 
 
@@ -327,7 +333,7 @@ def sample_kernels(value, uv, weights, visible_cells, offsets, height, width, bi
     out = torch.empty(shape, dtype=torch.float32, device=value.device)
     if out.numel():
         rows, sizes, grid = _plan_launch(value, weights)
-        with torch.cuda.device_of(value):
+        with torch.cuda.device_of(value):  # Triton launches on the current device
             forward_kernel[grid](
                 value.contiguous(),
                 uv.contiguous(),
@@ -366,15 +372,16 @@ def sample_kernels_backward(
         bilinear: Interpolate between pixels instead of rounding to one.
 
     Returns:
-        Gradients of the maps, in the dtype of ``value`` (B, V, h * w, heads, C); of the points,
-        float32 (B, V, Q, heads, 2); and of the weights, float32 (B, Q, heads, S).
+        Gradients of the maps, in the dtype of ``value`` (B, V, h * w, heads, C); of the projections
+        ``uv``, float32 (B, V, Q, heads, 2); and of the weights, float32 (B, Q, heads, S).
     """
+    # In float32, since the kernel adds many small values to each entry.
     grad_value = torch.zeros(value.shape, dtype=torch.float32, device=value.device)
     grad_uv = torch.zeros(uv.shape, dtype=torch.float32, device=value.device)
     grad_weights = torch.zeros(weights.shape, dtype=torch.float32, device=value.device)
     if grads.numel():
         rows, sizes, grid = _plan_launch(value, weights)
-        with torch.cuda.device_of(value):
+        with torch.cuda.device_of(value):  # Triton launches on the current device
             backward_kernel[grid](
                 grads.contiguous(),
                 value.contiguous(),

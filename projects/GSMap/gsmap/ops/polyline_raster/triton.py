@@ -23,7 +23,7 @@ from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 TILE = 16
 OPTIONS = {"num_warps": 1, "enable_fp_fusion": True}
 CHUNK = tl.constexpr(32)  # number of edges at a time: the bits of an integer
-EPS = tl.constexpr(LENGTH_EPS)
+EPS = tl.constexpr(LENGTH_EPS)  # added to squared lengths of edges, as in the reference
 SHORTEST = tl.constexpr(1e-30)  # smallest squared length of an edge, which may be a point
 
 
@@ -43,7 +43,7 @@ def _tile_pixels(height, width, TILE: tl.constexpr):
 
 @triton.jit
 def _ends(ring, edge, count):
-    """Start (x, y) of an edge of a closed ring, and the vector to its end."""
+    """Start (x, y) of an edge of a closed ring of ``count`` vertices, and the vector to its end."""
     following = tl.where(edge + 1 < count, edge + 1, 0)
     x = tl.load(ring + 2 * edge)
     y = tl.load(ring + 2 * edge + 1)
@@ -58,6 +58,15 @@ def _nearest_edges(ring, num_edges, count, x, y, eps, TILE: tl.constexpr):
 
     The flags are True for pixels inside of the ring. The term is a scalar that is added to the
     mask: NaN if a vertex is not finite, otherwise zero.
+
+    Args:
+        ring: Pointer to the vertices (x, y). (count, 2)
+        num_edges: Number of edges: ``count`` for a closed ring, one fewer for an open polyline.
+        count: Number of vertices.
+        x: x of the pixel centres, in the unit of the vertices. (1, TILE)
+        y: y of the pixel centres. (TILE, 1)
+        eps: Number that is added to the squared length of an edge.
+        TILE: Side of a tile in pixels.
     """
     nearest = tl.full((TILE, TILE), float("inf"), dtype=tl.float32)
     edge_index = tl.full((TILE, TILE), 0, dtype=tl.int32)
@@ -65,6 +74,7 @@ def _nearest_edges(ring, num_edges, count, x, y, eps, TILE: tl.constexpr):
     poison = 0.0
     for edge in range(num_edges):
         x0, y0, edge_x, edge_y = _ends(ring, edge, count=count)
+        # A number minus itself is NaN if it is infinite or NaN.
         poison += (edge_x - edge_x) + (edge_y - edge_y)
         length2 = tl.maximum(edge_x * edge_x + edge_y * edge_y + eps, SHORTEST)
         offset_x = x - x0
@@ -79,6 +89,7 @@ def _nearest_edges(ring, num_edges, count, x, y, eps, TILE: tl.constexpr):
         edge_index = tl.where(closer, edge, edge_index)
         # The ray from the pixel towards larger x crosses the edge: it changes between outside and
         # inside (even-odd rule). Offsets are relative to the start of the edge.
+        # Each comparison is whether an end of the edge lies above the pixel (larger y).
         straddles = (offset_y < 0) != (offset_y < edge_y)
         rise = tl.where(edge_y == 0, 1.0, edge_y)  # no division by 0
         inside ^= (straddles & (offset_x < edge_x * offset_y / rise)).to(tl.int32)
@@ -189,14 +200,16 @@ def soft_backward_kernel(
     softness = tl.where(filled, polygon_softness, line_softness)
     distance = _distance(squared, min_distance, PLAIN=PLAIN)
     fade = tl.exp(-distance / softness)
-    area_slope = tl.where(inside, fade, -fade) / ((1 + fade) * (1 + fade))  # of the sigmoid
+    # Derivative of a polygon's sigmoid by D / s. A line's exp(-D / s) has the derivative -fade.
+    area_slope = tl.where(inside, fade, -fade) / ((1 + fade) * (1 + fade))
     grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0)
     weight = grad * tl.where(filled, area_slope, -fade) / softness  # gradient of D
     if PLAIN:  # gradient of the squared distance, whose root is D
         weight *= tl.where(distance > min_distance, 0.5 / distance, 0.0)
+    # Entries of this tile in `sums`, 4 for each edge.
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * count * 4
     for first in range(0, count, CHUNK):
-        bit = edge_index - first
+        bit = edge_index - first  # position of the nearest edge of each pixel in this chunk
         in_chunk = (weight != 0) & (bit >= 0) & (bit < CHUNK)
         # One bit for the nearest edge of each pixel. The inner `where` keeps shifts in 0 to 31.
         pixel_bits = tl.where(in_chunk, 1 << tl.where(in_chunk, bit, 0), 0)
@@ -224,7 +237,7 @@ def soft_backward_kernel(
             # `end_y`), and -dS/do - dS/de for the start.
             between = (along >= 0) & (along <= 1)
             slip = tl.where(between, 2 * (dx * edge_x + dy * edge_y) / length2, 0.0)
-            share = tl.where(edge_index == edge, weight, 0.0)
+            share = tl.where(edge_index == edge, weight, 0.0)  # only pixels nearest to this edge
             end_x = -2 * t * dx - slip * (offset_x - 2 * t * edge_x)
             end_y = -2 * t * dy - slip * (offset_y - 2 * t * edge_y)
             tl.store(out + edge * 4, tl.sum(share * (slip * edge_x - 2 * dx - end_x)))
@@ -370,7 +383,7 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
             TILE=TILE,
             **OPTIONS,
         )
-    starts, ends = sums.sum(1).split(2, -1)
+    starts, ends = sums.sum(1).split(2, -1)  # gradients of both ends of each edge. (n, V, 2) each
     poison = (rings - rings).sum((1, 2), keepdim=True)  # NaN if a vertex is not finite
     # Edge i goes from vertex i to vertex i + 1, whose index is 0 for the last edge.
     return (starts + ends.roll(1, 1) + poison,)
@@ -384,7 +397,8 @@ def draw_polylines(polylines, filled, height, width, frame, half_width, pixel):
         filled: Whether a polyline is filled as a polygon, bool. (K,)
         height: Rows H of the raster.
         width: Columns W of the raster.
-        frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
+        frame: Four numbers: smallest x and y of the raster, and the size of a pixel along x and y,
+            in metres.
         half_width: Half the width of a line in metres.
         pixel: Side in metres of a square with the area of a pixel.
 

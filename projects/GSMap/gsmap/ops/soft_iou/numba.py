@@ -61,12 +61,14 @@ def sum_minima(preds, starts, indices, values, out, first, last):
 def pairwise_minima(preds, targets):
     """Sum the pixelwise minima of each pair of flat float32 masks.
 
-    Shapes: (N, pixels), (K, pixels) -> (N, K)
+    Shapes: (N, pixels), (K, pixels) -> (N, K). For masks in [0, 1] the sum of minima is the
+    intersection of a soft IoU.
     """
     minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
     starts, indices, values = list_pixels(targets.contiguous().numpy())
     # `run_in_threads` divides the predictions among threads, and gives the kernel their range
-    # (`first`, `last`). The work for one prediction is the number of listed pixels, from which
+    # (`first`, `last`). It passes tensors as arrays, so the kernel writes to the memory of
+    # `minima`. The work for one prediction is the number of listed pixels, from which
     # `run_in_threads` decides whether threads are worth their start.
     run_in_threads(sum_minima, len(indices), preds, starts, indices, values, minima)
     return minima
