@@ -2,7 +2,8 @@
 
 Markdown files outside docs/ become pages of the site. In the repository, links between Markdown
 files are relative paths. The hooks turn them into links of the site. A link to a source file leads
-to a page that shows the file.
+to a page that shows the file. MkDocs calls the functions ``on_...`` by their names, in the order in
+which they stand here.
 """
 
 import html
@@ -34,10 +35,13 @@ OUTSIDE |= {f"results/{path.name}": f"results/{path.name}" for path in REPO.glob
 # The inverse: file of the repository -> page of the site.
 PAGES = {source: page for page, source in OUTSIDE.items()}
 LANGUAGES = {".py": "python", ".sh": "bash", ".json": "json"}
-# The first two alternatives match fenced and inline code, which has no ``target`` and is kept.
+# The first two alternatives match fenced and inline code, which has no ``target`` and is kept. The
+# third one matches a relative link ``](target#anchor)``. A link with a colon is a URL and no match.
 LINK = re.compile(
     r"```.*?```|`[^`\n]*`|\]\((?P<target>[^)\s:#]+)(?P<anchor>#[^)\s]*)?\)", re.DOTALL
 )
+# HTML that mkdocstrings makes of docstrings: an equation, the heading of a class or function with
+# its module and name, and the role before a name, which MkDocs would show as text.
 MATH = re.compile(r":math:<code>(.*?)</code>", re.DOTALL)
 NAME = re.compile(r'<h3 id="([\w.]+)\.(\w+)" class="doc doc-heading">.*?</h3>', re.DOTALL)
 ROLE = re.compile(r":(?:class|func|meth):(?=<code>)")
@@ -64,17 +68,19 @@ def links(text: str, folder: str) -> set[str]:
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Insert the pages of the methods into the navigation, after ``methods.md``.
 
-    They come in the order of `METHODS`. Methods without a page are left out.
+    They come in the order of `METHODS`, which lists the name and the title of each method. Methods
+    without a page are left out.
     """
     # The navigation has exactly one part "Models", a list of entries {title: page}.
     (models,) = (part["Models"] for part in config.nav or () if "Models" in part)
-    place = next(n for n, page in enumerate(models, start=1) if "methods.md" in page.values())
+    # The enumeration starts at 1, so the number is the index after the entry of methods.md.
+    position = next(n for n, page in enumerate(models, start=1) if "methods.md" in page.values())
     entries = []
     for method in METHODS:
         page = f"methods/{method.name}.md"
         if (REPO / "docs" / page).is_file():
             entries.append({method.title: page})
-    models[place:place] = entries
+    models[position:position] = entries
     return config
 
 
@@ -99,29 +105,31 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Turn links between files of the repository into links between pages of the site."""
     here = page.file.src_uri
-    if here.startswith("source/"):
+    if here.startswith("source/"):  # shows a file as it is
         return markdown
+    # Folder of the page's file in the repository, from which its links start.
     folder = posixpath.dirname(OUTSIDE.get(here, f"docs/{here}"))
 
-    def on_site(match: re.Match[str]) -> str:
+    def site_link(match: re.Match[str]) -> str:
         target = match["target"]
-        if not target:
+        if not target:  # the match is code
             return match[0]
         path = posixpath.normpath(posixpath.join(folder, target))
         if path in PAGES:
-            found = PAGES[path]
+            target_page = PAGES[path]
         elif path.startswith("docs/"):
-            found = path.removeprefix("docs/")
+            target_page = path.removeprefix("docs/")
         else:
-            found = source_page(path)
-        relative = posixpath.relpath(found, posixpath.dirname(here) or ".")
+            target_page = source_page(path)
+        relative = posixpath.relpath(target_page, posixpath.dirname(here) or ".")
         return f"]({relative}{match['anchor'] or ''})"
 
-    return LINK.sub(on_site, markdown)
+    return LINK.sub(site_link, markdown)
 
 
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Convert equations to MathML, remove roles before names, and add import lines to headings."""
+    # `convert` needs LaTeX with characters such as "<", which are escaped in HTML.
     content = MATH.sub(lambda match: convert(html.unescape(match[1])), content)
     return NAME.sub(with_import, ROLE.sub("", content))
 
@@ -129,8 +137,11 @@ def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files
 def with_import(heading: re.Match[str]) -> str:
     """Return the heading of a class or function, followed by the line that imports it.
 
-    The import is from the outermost package that lists the name in ``__all__``, or else from the
-    module that defines the name.
+    The name is imported from the outermost package that lists it in ``__all__``. If no package
+    lists it, the name is imported from the module that defines it.
+
+    Args:
+        heading: Match of ``NAME``, whose groups are the module and the name.
     """
     module, name = heading.groups()
     packages = accumulate(module.split("."), "{}.{}".format)  # a, a.b and a.b.c for a.b.c

@@ -15,6 +15,12 @@ from gsmap.utils.words import format_count
 
 
 def main(argv: list[str] | None = None) -> str:
+    """Write the compact result file, and return the report that `run_command` prints.
+
+    Args:
+        argv: Arguments of the command; None for the arguments of this process.
+    """
+    # The module's docstring is also the help text.
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -23,6 +29,8 @@ def main(argv: list[str] | None = None) -> str:
     parser.add_argument("--degree", type=int, default=3, help="degree of the curves, 1 to 5")
     parser.add_argument("--max-error", type=float, default=0.1, help="largest error in metres")
     args = parser.parse_args(argv)
+    # Numbers of replaced elements, of their points and of the control points of the curves, and the
+    # largest error in metres
     summary = compact_results(args.results, args.out, args.degree, args.max_error)
     old_mb = args.results.stat().st_size / 1e6
     new_mb = args.out.stat().st_size / 1e6

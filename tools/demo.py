@@ -29,6 +29,7 @@ from gsmap.utils.words import markdown_table
 
 MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}
 """Names of the models that ship with the library, by the title of their method."""
+# Text at the end. `activate` is a script of the Python environment, `root` the folder of the data.
 NEXT = """
 To go on in this environment:
     source {activate}
@@ -70,10 +71,10 @@ class Training:
 
     Attributes:
         model: Name of the model in ``MODELS``.
-        start: Start of the training, as the table names it.
+        start: Weights from which the training starts, in the words of the table.
         work: Folder of the checkpoints. The folders of the tests begin with its name.
         epochs: Number of epochs.
-        options: Overrides of the config.
+        options: Overrides of the config, each ``key=value``.
     """
 
     model: str
@@ -88,7 +89,7 @@ class Training:
         return f"{self.model} {self.start}"
 
     def test_folder(self, name: str) -> Path:
-        """Folder of one of the tests: ``test`` or ``shuffled``."""
+        """Folder of one of the tests: ``test``, or ``shuffled`` with images of other samples."""
         return self.work.with_name(f"{self.work.name}_{name}")
 
 
@@ -106,6 +107,7 @@ def trainings(
     runs = []
     for name in names:
         work = folder / f"{name.lower()}_tuned"
+        # The training starts from the weights of the MapTR that ships.
         options = (f"load_from={MODELS['MapTR']}", "optim_wrapper.optimizer.lr=3e-4")
         tuned = Training(
             name,
@@ -136,7 +138,10 @@ class Step:
     products: list[Path]
 
     def stamp(self, folder: Path) -> Path:
-        """File that marks the success of this command with these arguments."""
+        """File that marks the success of this command with these arguments.
+
+        Its name has a digest of the command, so a command with other arguments runs again.
+        """
         digest = hashlib.sha256(shlex.join(self.command).encode()).hexdigest()[:12]
         return folder / ".done" / f"{self.title.replace(' ', '-')}-{digest}"
 
@@ -157,9 +162,10 @@ class Step:
         environment = {**os.environ, "PYTHON": sys.executable}  # read by the shell scripts
         status = subprocess.run(
             command,
-            cwd=shipped_path(),
+            cwd=shipped_path(),  # root of the installed repository, for paths such as tools/test.py
             env=environment,
             check=False,
+            # On Linux, the command is killed if the demo dies.
             preexec_fn=partial(die_with_parent, os.getpid()),
         ).returncode
         missing = [str(product) for product in self.products if not product.exists()]
@@ -177,7 +183,7 @@ def process_count() -> int:
     On a CPU, one process with one thread per core uses the cores better than one process with many
     threads.
     """
-    import torch
+    import torch  # imported here: it loads slowly, and --help does not need it
 
     return torch.cuda.device_count() or len(os.sched_getaffinity(0))
 
@@ -233,7 +239,10 @@ def data_steps(folder: Path, budget: Budget, split: str) -> Iterable[Step]:
 
 
 def prior_step(folder: Path, budget: Budget) -> Step:
-    """Step that scores the best fixed map, which is predicted for every sample."""
+    """Step that scores the best fixed map, which is predicted for every sample.
+
+    The map is fitted on the training data. Its score shows how much is possible without images.
+    """
     truth = annotations(folder, budget, "val")
     train = annotations(folder, budget, "train")
     metrics = folder / "prior.json"
@@ -246,9 +255,10 @@ def test_step(title: str, model: list[str], work: Path, root: Path, options: lis
 
     Args:
         title: Action of the step, for the console.
-        model: Name of a model that ships, or config and checkpoint.
+        model: First arguments of ``tools/test.py``: the name of a model that ships, or config and
+            checkpoint.
         work: Work folder of the test.
-        root: Folder with the towns.
+        root: Data root: folder with the towns.
         options: Further options of ``tools/test.py``.
     """
     metrics = work / "metrics.json"
@@ -315,6 +325,7 @@ def training_steps(training: Training, folder: Path, budget: Budget) -> Iterable
     model = [config, str(checkpoint)]
     test = training.test_folder("test")
     yield test_step(f"test and draw {title}", model, test, val, options=drawing_options(test))
+    # The score with wrong images shows how much the model depends on its images.
     yield test_step(
         f"test {title} on images of other samples",
         model,
@@ -332,6 +343,7 @@ def table(folder: Path, shipped: Iterable[str], trained: Iterable[Training]) -> 
         shipped: Names of the models that ship.
         trained: The trainings of the demo.
     """
+    # File of the metrics of each row, by the name of the row.
     rows = {"same map everywhere (prior)": folder / "prior.json"}
     for name in shipped:
         rows[f"{name} that ships"] = folder / f"shipped_{name.lower()}/metrics.json"
@@ -340,16 +352,17 @@ def table(folder: Path, shipped: Iterable[str], trained: Iterable[Training]) -> 
         others = f"{training.title}, images of other samples"
         rows[others] = training.test_folder("shuffled") / "metrics.json"
     keys = []
-    head = ["model"]
+    head = ["model"]  # headings, one for each key behind the first column
     for metric in ("chamfer", "raster"):
         for name in CLASSES:
             keys.append(f"{metric}/{name}/AP")
             head.append(f"{metric} {name}")
         keys.append(f"{metric}/mAP")
         head.append(f"{metric} mAP")
-    lines = []
+    lines = []  # cells of each row
     for name, path in rows.items():
         figures = json.loads(path.read_text())
+        # A cell is empty if the metrics lack the figure.
         cells = [f"{100 * figures[key]:.1f}" if key in figures else "" for key in keys]
         lines.append([name, *cells])
     return markdown_table(head, lines)

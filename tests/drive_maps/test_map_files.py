@@ -21,6 +21,7 @@ GRID = (
     MapGrid("EPSG:32632") if pytest.importorskip("pyproj", reason="pip install -e .[maps]") else 0
 )
 LINE = [[0.0, 0.0], [10.0, 0.0]]
+TINY_RING = [[0, 0], [0.01, 0], [0, 0.01], [0, 0]]
 RING = [[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]
 
 
@@ -157,6 +158,10 @@ HOSTILE_GEOJSON = {
     "other words": (
         geojson([feature("LineString", LINE, kind="kerb")]),
         r"has no element of .*, but 1 x without 'class': name the property",
+    ),
+    "only areas without area": (
+        geojson([feature("Polygon", [TINY_RING], **{"class": "ped_crossing"})]),
+        "has no element of .*, but 1 x ped_crossing without area",
     ),
     "far away": (geojson([divider([[0, 0], [1e9, 0]])]), r"reaches 1e\+09 m"),
 }  # fmt: skip

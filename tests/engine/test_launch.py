@@ -47,6 +47,17 @@ def test_one_folder_serves_every_split_unless_an_override_says_otherwise(swapped
     assert args.data_root == Path("there")
 
 
+def test_the_last_of_two_data_roots_and_image_scales_counts():
+    words = ["--data-root", "first", "--cfg-options", "val_dataloader.dataset.data_root=other"]
+    words += ["--image-scale", "0.25", "--data-root", "last", "--image-scale", "0.5"]
+    args = parse("maptr_r18_minicity", *words)
+    assert args.data_root == Path("last")
+    assert args.cfg_options["image_scale"] == 0.5
+    cfg = load_config(args)
+    roots = [cfg[f"{split}_dataloader"].dataset.data_root for split in SPLITS]
+    assert roots == ["last", "other", "last"]
+
+
 @pytest.mark.parametrize(
     ("option", "instead"),
     [

@@ -9,8 +9,8 @@ from test_files import command, results_of
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSample
-from gsmap.evaluation.analysis.change_files import read_changes
-from gsmap.evaluation.analysis.changes import change_figures
+from gsmap.evaluation.analysis.change_files import MapChange, read_changes
+from gsmap.evaluation.analysis.changes import change_figures, with_map_names
 from gsmap.evaluation.analysis.groups import read_groups
 from gsmap.evaluation.core.results_json import write_results
 
@@ -264,3 +264,12 @@ def test_a_file_of_another_form_is_refused(text, message, tmp_path):
     with pytest.raises(ValueError, match=message) as error:
         read_changes(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_change_without_a_map_needs_exactly_one_map():
+    points = np.array([[0.0, 0.0], [0.0, 5.0]])
+    change = MapChange("added", "divider", "", points, old_points=None, confidence=1.0)
+    assert [c.map_name for c in with_map_names([change], ["town"], "f")] == ["town"]
+    for names in ([], ["town", "other"]):
+        with pytest.raises(ValueError, match=f"has {len(names)} maps: name one for each change"):
+            with_map_names([change], names, "f")

@@ -285,9 +285,18 @@ def test_a_grid_that_is_too_large_is_refused():
         {"tile_m": 60.1},
         {"tile_m": 1e9},
         {"tile_m": math.inf},
+        {"tile_m": 0.1},
+        {"cell_m": 0.1, "tile_m": 102.5},
     ],
     ids=str,
 )
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(ValueError, match="must be"):
         PriorSettings(**{"classes": ("a",), "place": "town", **wrong})
+
+
+@pytest.mark.parametrize(
+    ("cell_m", "tile_m", "cells"), [(0.1 + 0.2, 0.3, 1), (0.1, 102.4, 1024), (0.3, 60.0, 200)]
+)
+def test_a_tile_has_whole_cells_whatever_is_rounded(cell_m, tile_m, cells):
+    assert PriorSettings(("a",), "town", cell_m=cell_m, tile_m=tile_m).tile_cells == cells

@@ -57,6 +57,9 @@ def test_pixels_of_a_size_in_metres_divide_the_extent():
     for sizes, named in ((0.7, "0.7 x 0.7"), ([0.5, 0.7], "0.5 x 0.7"), ([0.7, 0.5], "0.7 x 0.5")):
         with pytest.raises(ValueError, match=f"pixels of {named} m do not divide .* 60 x 30 m"):
             grid.rasterized(sizes)
+    for sizes in (0, -0.3, float("nan"), [0.5, 0.0]):
+        with pytest.raises(ValueError, match="pixel_m must be > 0 m, got "):
+            grid.rasterized(sizes)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ def test_a_calibration_is_read_and_its_law_is_the_normal_one_by_default():
         {"law": ["normal"], "sigmas": 1.0},
         {"law": "normal", "sigmas": float("nan")},
         {"law": "normal", "sigmas": "1"},
+        {"law": "normal", "sigmas": True},
     ],
 )
 def test_what_is_no_calibration_is_refused(said):

@@ -67,4 +67,6 @@ def test_a_scene_that_does_not_exist_is_named_with_one_that_does(tmp_path):
     annotations, results = write_case(tmp_path)
     with pytest.raises(ValueError, match="no scene 'scene-0003': give one of its 1, such as"):
         film.write_drive_film(tmp_path / "no.mp4", annotations, results, scene="scene-0003")
+    with pytest.raises(ValueError, match="results must name at least one result file"):
+        film.write_drive_film(tmp_path / "no.mp4", annotations, {})
     assert not (tmp_path / "no.mp4").exists()

@@ -20,7 +20,8 @@ def parse_args(description: str | None, argv: list[str] | None = None) -> argpar
         argv: The words of the command line; None reads the command line of the process.
 
     Returns:
-        The options. ``eval`` is the list of metric names, without repetitions.
+        The options. ``eval`` is the list of metric names, without repetitions. It includes the
+        metrics that ``--pld`` and ``--topology`` select.
     """
     parser = CommandParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -32,13 +33,14 @@ def parse_args(description: str | None, argv: list[str] | None = None) -> argpar
     add_outputs(parser)
     add_shard_options(parser)
     args = parser.parse_args(argv)
-    check_combinations(parser, args)
+    check_combinations(parser, args)  # ends the command with a message if options do not fit
     args.eval = metric_names(args)
     return args
 
 
 def add_inputs(parser: argparse.ArgumentParser) -> None:
     """Add the input files and the conditions that they must meet."""
+    # Optional, because --prior replaces it. A single file is then the ground truth.
     parser.add_argument("results", type=Path, nargs="?", help="results in MapTR's JSON form")
     parser.add_argument(
         "ground_truth", type=Path, help="annotation file (*.arrow), or JSON with a list of GTs"
@@ -152,13 +154,16 @@ def add_rules(parser: argparse.ArgumentParser) -> None:
 
 
 def add_analysis(parser: argparse.ArgumentParser) -> None:
-    """Add analyses of the metrics, of drives and of Gaussians."""
+    """Add analyses of the metrics, of drives and of Gaussians.
+
+    An argument of type `output_file` is checked when it is read: its folder must be writable.
+    """
     group = parser.add_argument_group("analysis")
     group.add_argument(
         "--bootstrap",
         type=int,
         nargs="?",
-        const=1000,
+        const=1000,  # value of --bootstrap without a number
         metavar="N",
         help="interval of 95 %% for every AP, from N resamples of the scenes (1000)",
     )
@@ -221,6 +226,7 @@ def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace
     """Refuse options that exclude each other, or that need another option."""
     if args.results and args.results.suffix == ".arrow":
         parser.error(f"{args.results} holds ground truth: name the result file before it")
+    # Exactly one of the two must be given.
     if (args.results is None) == (args.prior is None):
         parser.error("name either a result file or --prior")
     if args.hard and args.thresholds:
@@ -236,7 +242,7 @@ def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace
     check_changes(parser, args)
     if args.by == DISTANCE and args.dim == 3:
         parser.error("--by distance is in the plane: leave out --dim 3")
-    if args.shard.count:
+    if args.shard.count:  # 0 for all samples, without --shard
         check_shard(parser, args)
 
 
@@ -252,7 +258,8 @@ def check_changes(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
     if args.shard.count:
         parser.error("--changes needs all changes: leave out --shard")
     for name in ("by", "bootstrap", "against", "consistency", "uncertainty", "pr_curves"):
-        if getattr(args, name) not in (None, False):  # the option was given
+        # None and False are the values of options that were not given.
+        if getattr(args, name) not in (None, False):
             option = "--" + name.replace("_", "-")
             parser.error(f"{option} applies to elements, not to changes: leave it or --changes out")
 
@@ -276,13 +283,17 @@ def check_shard(parser: argparse.ArgumentParser, args: argparse.Namespace) -> No
     if not args.out:
         parser.error("--shard needs --out")
     for name in ("pr_curves", "bootstrap", "against", "by", "consistency", "uncertainty"):
-        if getattr(args, name) not in (None, False):  # the option was given
+        # None and False are the values of options that were not given.
+        if getattr(args, name) not in (None, False):
             option = "--" + name.replace("_", "-")
             parser.error(f"{option} needs all samples: leave out --shard")
 
 
 def metric_names(args: argparse.Namespace) -> list[str]:
-    """Names of the metrics that ``--eval``, ``--pld`` and ``--topology`` select, once each."""
+    """Names of the metrics that ``--eval``, ``--pld`` and ``--topology`` select, once each.
+
+    They are in the order in which they are selected.
+    """
     names = list(args.eval)
     if args.pld:
         names.append("pld")
@@ -290,4 +301,4 @@ def metric_names(args: argparse.Namespace) -> list[str]:
         names.append("topology")
         if args.dim == 3:
             names.append("heights")
-    return list(dict.fromkeys(names))
+    return list(dict.fromkeys(names))  # keys are unique and keep their order

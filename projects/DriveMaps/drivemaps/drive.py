@@ -13,12 +13,12 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElemen
 from gsmap.utils.errors import InputError
 
 MIN_LENGTH_M = 2.0
-"""Smallest length in metres of a line in the map of a drive."""
+"""Smallest length in metres of a line in the map of a drive. `line_merging` drops shorter lines."""
 MIN_AREA_M2 = 1.0
-"""Smallest area in square metres of an area in the map of a drive."""
+"""Smallest size in square metres of an area in the map. `area_merging` drops smaller areas."""
 SIMPLIFY_M = 0.02
 """Tolerance of simplification in metres: dropped vertices lie at most this far from the line."""
-_SLACK_M = 1e-3  # covers the rounding of transforms
+_SLACK_M = 1e-3  # added to `Drive.reach_m`, covers the rounding of transforms
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,8 @@ class DriveFrame:
     """One sample of a drive with its map.
 
     Args:
-        sample: Sensors and poses.
+        sample: Sensors and poses. Its ``global_from_frame`` (4, 4) is the transform from the
+            annotation frame, the frame of the vehicle or LiDAR, to the global frame, in metres.
         elements: Map of the sample, (x, y) in metres in the global frame.
     """
 
@@ -71,6 +72,7 @@ class DriveFrame:
         Returns:
             Points in the annotation frame. (..., 2)
         """
+        # The inverse of a rotation is its transpose, so `.T` of `to_global` is left out here.
         return (points - self.origin) @ self.rotation
 
 
@@ -103,8 +105,8 @@ class Drive:
             True for points in the range. (M,)
         """
         low, high = np.array([self.x_range, self.y_range]).T  # corners (x, y) of the range
-        local = frame.to_frame(points)
-        return ((local >= low) & (local <= high)).all(axis=1)
+        frame_points = frame.to_frame(points)
+        return ((frame_points >= low) & (frame_points <= high)).all(axis=1)
 
     @property
     def scenes(self) -> list[str]:
@@ -128,6 +130,7 @@ class Drive:
             Number of frames. (M,)
         """
         counts = np.zeros(len(points), np.int64)
+        # The tree finds the points near a frame, so only these points are transformed to the frame.
         tree = cKDTree(points)
         for frame in self.frames:
             near = tree.query_ball_point(frame.origin, self.reach_m)
@@ -147,7 +150,7 @@ class Drive:
         # `reduceat` reduces the points from each offset to the next one. For an empty element, it
         # would return a point of the next element, so empty elements are left out.
         nonempty = np.flatnonzero(elements.num_points)
-        if not len(nonempty):
+        if not len(nonempty):  # there is no vertex at all, and `reduceat` needs one
             return elements
         starts = elements.offsets[nonempty]
         points = elements.points[:, :2]
@@ -183,21 +186,21 @@ def read_drive(
         name: Name of the drive; empty for the name of the first scene.
 
     Returns:
-        Frames with their maps in the global frame.
+        Frames of all scenes in the order of time, with their maps in the global frame. Heights of
+        the maps are dropped.
 
     Raises:
         ValueError: If the file lacks a scene, or no sample of a scene has a map.
     """
     samples_of_scene: dict[str, list[MapSample]] = {scene: [] for scene in scenes}
-    names = annotations.column("scene")
+    scene_of_row = annotations.column("scene")  # name of the scene of each sample of the file
     for scene in scenes:
-        if scene not in names:
-            raise InputError(
-                f"{annotations.path} has no scene {scene!r}, but {sorted(set(names))[:5]} ..."
-            )
-    for row, scene in enumerate(names):
+        if scene not in scene_of_row:
+            some_scenes = sorted(set(scene_of_row))[:5]
+            raise InputError(f"{annotations.path} has no scene {scene!r}, but {some_scenes} ...")
+    for row, scene in enumerate(scene_of_row):
         if scene in samples_of_scene:
-            sample = annotations[row]
+            sample = annotations[row]  # reads the sample from the file
             if sample.token in maps:
                 samples_of_scene[scene].append(sample)
     samples = []
@@ -232,7 +235,7 @@ def drive_map(rows: Iterable[tuple[int, FloatArray, float]], scored: bool = True
         scored: Whether the map keeps the scores.
 
     Returns:
-        Elements ordered by class, then by falling score, then by the first vertex. (N,)
+        The N elements, ordered by class, then by falling score, then by the first vertex.
     """
     simple_rows = []
     for label, line, score in rows:
@@ -253,5 +256,6 @@ def drive_map(rows: Iterable[tuple[int, FloatArray, float]], scored: bool = True
 def _order_in_map(row: tuple[int, FloatArray, float]) -> tuple[float, ...]:
     """Key that sorts by class, then by falling score, then by the first vertex."""
     label, line, score = row
+    # Rounded, so that differences in the last digits do not change the order.
     x, y = np.round(line[0], 6)
     return label, -round(score, 9), x, y

@@ -176,18 +176,13 @@ class ElementCollector:
                 in metres.
 
         Returns:
-            The map. It is empty if the file has no elements, or only areas that are too small.
+            The map. It is empty if the file has no elements.
 
         Raises:
             ValueError: If a coordinate is out of range, or the file has elements but none of them
-                was added.
+                is used.
             RuntimeError: If lines are in degrees and ``pyproj`` is missing.
         """
-        if not self._lines and self.unused:
-            raise InputError(
-                f"{self._path} has no element of {list(self._classes)}, but {self.describe()}: "
-                "name the property of the class and its values with --map-classes."
-            )
         lines = []
         labels = []
         scores = []
@@ -208,6 +203,11 @@ class ElementCollector:
             lines.append(points)
             labels.append(label)
             scores.append(score)
+        if not lines and self.unused:
+            raise InputError(
+                f"{self._path} has no element of {list(self._classes)}, but {self.describe()}: "
+                "name the property of the class and its values with --map-classes."
+            )
         return MapFile(MapElements.from_polylines(lines, labels, scores), unused=self.unused)
 
     def describe(self) -> str:

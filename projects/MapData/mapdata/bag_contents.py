@@ -1,4 +1,9 @@
-"""First pass over a bag, which reads calibrations, transforms, poses, and the times of images."""
+"""First pass over a bag, which reads calibrations, transforms, poses, and the times of images.
+
+A bag is a recording of ROS: messages on topics. A connection of a bag stands for messages of one
+topic and one type. The stamp of a message is the time that its publisher has written into it. A
+camera info is the message with the calibration of a camera.
+"""
 
 import hashlib
 from collections import Counter, defaultdict
@@ -33,11 +38,11 @@ class BagContent:
 
     Args:
         infos: Camera info, by the topic of the images.
-        images: Frame, times and sizes of the images, by their topic.
-        tree: Frames of the transforms.
+        images: Coordinate frame, times and sizes of the images, by their topic.
+        tree: Tree of the coordinate frames that the transforms connect.
         odometries: Odometry, by topic, parent frame and child frame.
         digest: SHA-256 object of all messages. The folder of the images is named by its digest.
-        unread: Errors of single messages that cannot be read, by topic.
+        unread: Errors of single messages that cannot be read, at least one for each topic in it.
         unreadable: Reason why no message of a topic can be read, by topic.
         unstamped: Number of transforms and poses with the stamp 0, by topic.
         changed_infos: Number of camera infos that differ from the first one of the camera, by the
@@ -57,7 +62,8 @@ class BagContent:
     def add_info(self, topic: str, info: Any) -> bool:
         """Store the first camera info with focal lengths, and count later ones that differ from it.
 
-        Before that, each camera info without focal lengths is stored in place of the previous one.
+        Until there is one with focal lengths, each camera info is stored in place of the previous
+        one, so that a bag without focal lengths has a camera info to report.
 
         Args:
             topic: Topic of the images.
@@ -94,12 +100,13 @@ class BagContent:
         is_static = is_static_topic(topic)
         for item in message.transforms:
             pose = _pose_matrix(item.transform.translation, item.transform.rotation)
-            child = item.child_frame_id.lstrip("/")
+            child = item.child_frame_id.lstrip("/")  # old names of frames begin with a slash
             parent = item.header.frame_id.lstrip("/")
             stamp = stamp_ns(item.header)
             self.tree.add(
                 topic, child=child, parent=parent, time_ns=stamp or recorded_ns, pose=pose
             )
+            # Transforms of static topics are valid at all times, so their stamps do not matter.
             if not stamp and not is_static:
                 self.unstamped[topic] += 1
 
@@ -158,16 +165,21 @@ class BagContent:
 
 
 def read_messages(bag: Bag, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
-    """Yield connection, time of recording in nanoseconds, and content of messages.
+    """Yield connection, time of recording in nanoseconds, and serialized content of messages.
+
+    Args:
+        bag: The bag, open.
+        connections: Connections whose messages are read.
 
     Raises:
         ValueError: If the bag is damaged.
     """
-    if not connections:
+    if not connections:  # nothing can be read
         return
     messages = iter(bag.messages(connections))
     while True:
         # Only the reading is in this context, not the code of the caller, which runs at ``yield``.
+        # The context converts all errors of the reading library to a ``ValueError``.
         with library_errors():
             message = next(messages, None)
         if message is None:
@@ -178,11 +190,16 @@ def read_messages(bag: Bag, connections: Sequence[Any]) -> Iterator[tuple[Any, i
 def stamp_ns(header: Any) -> int:
     """Stamp of a message's header in nanoseconds; 0 if the publisher set none."""
     stamp = header.stamp
+    # A ROS time has seconds `sec` and the nanoseconds beyond them.
     return int(stamp.sec) * 10**9 + int(getattr(stamp, "nanosec", 0) or 0)
 
 
 def _pose_matrix(position: Any, orientation: Any) -> np.ndarray:
-    """Pose from the position and the quaternion of a message. (4, 4)"""
+    """Pose from the position and the quaternion of a message. (4, 4)
+
+    Raises:
+        ValueError: If the position is not finite, or the quaternion does not have the length 1.
+    """
     wxyz = (orientation.w, orientation.x, orientation.y, orientation.z)
     pose = rigid(rotation_of(wxyz), (position.x, position.y, position.z))
     if not np.isfinite(pose).all():
@@ -208,7 +225,9 @@ def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
         if info_topic:
             image_topics_of[info_topic].append(image_topic)
     connections = _readable_connections(bag, topics=topics, content=content)
-    known_infos: dict[str, bytes] = {}  # content of the stored camera info without its stamp
+    # Content of the stored camera info after its stamp, by its topic. Equal messages are not
+    # parsed.
+    known_infos: dict[str, bytes] = {}
     for connection, recorded_ns, raw in read_messages(bag, connections):
         topic = connection.topic
         kind = connection.msgtype
@@ -220,7 +239,7 @@ def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
             with explain_errors(f"the message at {recorded_ns} ns", "it is damaged"):
                 with library_errors():
                     message = bag.parser(connection)(raw)
-                if topic in image_topics_of:
+                if topic in image_topics_of:  # a camera info
                     for image_topic in image_topics_of[topic]:
                         if content.add_info(image_topic, message):
                             known_infos[topic] = bytes(raw[_STAMP_END:])
@@ -236,7 +255,7 @@ def _readable_connections(
 ) -> list[Any]:
     """Select the connections of cameras, transforms and odometry that can be read.
 
-    The reasons for the other topics are stored in ``content.unreadable``.
+    For topics of these kinds that cannot be read, the reasons are stored in ``content.unreadable``.
     """
     camera_topics = set()
     for image_topic, info_topic in topics.values():
@@ -249,7 +268,7 @@ def _readable_connections(
         if connection.topic not in camera_topics and not is_pose:
             continue
         try:
-            bag.parser(connection)
+            bag.parser(connection)  # raises an error if the type of the messages is unknown
             readable.append(connection)
         except ValueError as error:
             reason = " ".join(str(error).split())  # in one line

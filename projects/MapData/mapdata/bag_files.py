@@ -1,4 +1,8 @@
-"""Files of a bag (a ROS recording): their suffixes, the parts of a recording, and their damage."""
+"""Files of a bag (a ROS recording): their suffixes, the parts of a recording, and their damage.
+
+A recording is one file, or a folder with several files, its parts. The recorder of ROS 2 (rosbag2)
+also writes ``metadata.yaml`` to the folder, which lists the parts. Notes are remarks for the user.
+"""
 
 import re
 import struct
@@ -12,11 +16,14 @@ from gsmap.utils.inputs import check_input
 from mapdata.mcap_bag import MAGIC, McapBag, is_plain_ros2
 from mapdata.ros_bag import RosBag
 
+# `RosBag` reads all kinds of bags by the package rosbags. `McapBag` reads MCAP files with messages
+# that rosbags does not know.
 Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
 _MOST_BYTES = 300_000  # largest metadata; parsing a thousand bytes of YAML takes milliseconds
 _ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", flags=re.MULTILINE)  # alias of YAML, such as *name
+# Suffixes of compressed files and archives.
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
 # First bytes of a file, by its suffix.
 _STARTS = {".mcap": MAGIC, ".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0"}
@@ -30,7 +37,7 @@ def is_bag(path: Path) -> bool:
 
 
 def parts_in(folder: Path) -> list[Path]:
-    """Files of bags in a folder, in the order of their numbers."""
+    """Files of bags in a folder, in the order of their numbers; hidden files are left out."""
     parts = []
     for path in folder.iterdir():
         is_hidden = path.name.startswith(".")
@@ -55,10 +62,11 @@ def bag_at(path: Path) -> Bag:
         The bag, with notes on files that are not read.
 
     Raises:
-        ValueError: If a folder holds parts of several recordings, or the path is a pipe.
+        ValueError: If a folder without metadata holds several recordings, the path is a pipe or a
+            device, an MCAP file is damaged, or the metadata are too long or have aliases of YAML.
     """
     if not path.is_dir():
-        check_input(path)
+        check_input(path)  # an error for a pipe, a device or an output of the command
         return _bag_of([path], notes=_notes_on([path]))
     parts = parts_in(path)
     if not (path / _METADATA).is_file():
@@ -80,18 +88,22 @@ def bag_at(path: Path) -> Bag:
         )
     if listed_parts and _needs_mcap_reader(listed_parts):
         return McapBag(listed_parts, notes=notes)
-    return RosBag([path], notes=notes)
+    return RosBag([path], notes=notes)  # rosbags reads the metadata of the folder itself
 
 
 def _bag_of(parts: Sequence[Path], notes: list[str]) -> Bag:
-    """Create the bag of some files; there must be at least one."""
+    """Create the bag of the parts of one recording; there must be at least one."""
     if _needs_mcap_reader(parts):
         return McapBag(parts, notes=notes)
     return RosBag(parts, notes=notes)
 
 
 def _needs_mcap_reader(parts: Sequence[Path]) -> bool:
-    """Whether files are MCAP files, at least one of which the package rosbags cannot read."""
+    """Whether files are MCAP files, at least one of which the package rosbags cannot read.
+
+    The files of one recording have one suffix, so the first file decides.
+    """
+    # `is_plain_ros2` is True for a file with messages of ROS 2 only, which rosbags can read.
     return parts[0].suffix == ".mcap" and not all(map(is_plain_ros2, parts))
 
 
@@ -187,7 +199,10 @@ def _listed_names(file: Path) -> list[str] | None:
 
 
 def _damage_of(path: Path) -> str | None:
-    """Describe the damage of one file and its remedy; None if no damage is found."""
+    """Describe the damage of one file and its remedy; None if no damage is found.
+
+    The file must have one of ``SUFFIXES``.
+    """
     if not path.is_file():
         return "it is a pipe, a socket or a device: give a plain file"
     size = path.stat().st_size
@@ -196,7 +211,7 @@ def _damage_of(path: Path) -> str | None:
     with path.open("rb") as file:
         start = file.read(4096)
         file.seek(max(size - len(MAGIC), 0))
-        end = file.read()
+        end = file.read()  # a complete MCAP file also ends with `MAGIC`
     if not start.startswith(_STARTS[path.suffix]):
         return (
             f"it begins with {start[:12]!r} and is no {path.suffix} file: is it a pointer of git "
@@ -215,6 +230,7 @@ def _damage_of(path: Path) -> str | None:
     if path.suffix == ".bag":
         # The header contains the position of the index, which is 0 until the recorder ends.
         index = re.search(rb"index_pos=(.{8})", start, flags=re.DOTALL)
+        # The position is an unsigned integer of 8 bytes, little-endian.
         position = struct.unpack("<Q", index[1])[0] if index else 0
         if not 0 < position <= size:
             return (
@@ -225,7 +241,10 @@ def _damage_of(path: Path) -> str | None:
 
 
 def _sqlite_size(header: bytes) -> int:
-    """Size of an SQLite file in bytes, according to its header."""
+    """Size of an SQLite file in bytes, according to its header.
+
+    The header has big-endian integers: the size of a page, and the number of pages.
+    """
     page_size = struct.unpack(">H", header[16:18])[0]
     if page_size == 1:
         page_size = 65536  # too large for the two bytes, so SQLite writes 1
@@ -239,6 +258,7 @@ def suffix_advice(path: Path) -> str | None:
     suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes[-2:] == [".bag", ".active"]:
         return f"its recorder was killed: `rosbag reindex {name}`, and rename it to end in .bag"
+    # A packed bag has two suffixes, such as .bag.gz.
     if suffixes and suffixes[-1] in _PACKED and set(suffixes) & set(SUFFIXES):
         return f"it is packed ({path.suffix}): unpack it first"
     if suffixes and suffixes[-1] in SUFFIXES:  # in capital letters, such as .BAG

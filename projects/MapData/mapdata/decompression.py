@@ -92,7 +92,7 @@ def _bound(module: Any) -> None:
 
 def _remaining_bytes() -> int:
     """Number of bytes by which the decompressed size of the current bag may still grow."""
-    return FREE_BYTES + TIMES * _Bag.packed - _Bag.unpacked
+    return max(0, FREE_BYTES + TIMES * _Bag.packed - _Bag.unpacked)
 
 
 def _count_unpacked(content: bytes, limit: int) -> bytes:

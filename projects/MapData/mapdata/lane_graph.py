@@ -8,12 +8,12 @@ import shapely
 
 from gsmap.utils.errors import InputError
 
-ROUND_DECIMALS = 3  # points closer than a millimetre are one node of the graph
+ROUND_DECIMALS = 3  # points that are equal after rounding to millimetres are one node of the graph
 SIMPLIFY_TOLERANCE_M = 0.2
-MAX_PATHS = 20_000
+MAX_PATHS = 20_000  # more paths in one frame mean that the map is damaged
 
-# Edge of the graph, without its start: ids of the points on the way, and id of the point at which
-# it ends.
+# Edge of the graph, without its start: indices of the points on the way, and index of the point at
+# which it ends.
 Edge = tuple[tuple[int, ...], int]
 # For each lane of a map, the list of its links. A link is a pair of positions in the list of lanes:
 # the second lane follows the first one, and the lane is one of the two.
@@ -49,9 +49,11 @@ class LanePaths:
 
     The graph has a node for every polyline point (rounded to 1 mm, so that lanes may share nodes),
     an edge between consecutive points, and an edge from the end of each lane to the start of each
-    of its successors. A path runs from a node without incoming edges to a node without outgoing
-    edges, and visits no node twice. Points that belong to one lane only are folded into the edges
-    once per map, so that the search in a frame takes about one step per lane.
+    of its successors. A path is simple: it visits no node twice. It runs from a node without
+    incoming edges to a node without outgoing edges. Points that belong to one lane only are folded
+    into the edges once per map, so that the search in a frame takes about one step per lane.
+
+    A subset of lanes is usually the lanes near the vehicle in one frame of a drive.
 
     Args:
         polylines: Points of each lane in the map frame, in metres, finite. (n >= 2, 3) each
@@ -67,6 +69,7 @@ class LanePaths:
                 raise InputError(f"polylines[{i}] must have shape (n >= 2, 3), got {line.shape}.")
             if not np.isfinite(line).all():
                 raise InputError(f"polylines[{i}] holds NaN or infinity.")
+        # The empty array allows a map without lanes.
         rounded = np.round(np.concatenate([np.empty((0, 3)), *polylines]), decimals=ROUND_DECIMALS)
         # Vertices at one place become one point. `nodes` is the index of the point of each vertex,
         # and `uses` the number of vertices of each point.
@@ -78,8 +81,9 @@ class LanePaths:
         ends = np.cumsum(list(map(len, polylines)), dtype=np.int64)
         lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
         self._edges = [_fold_points(lane, uses=uses) for lane in lanes]
-        # Each lane has a list of links. A link is two lanes that follow each other, and the edge
-        # between them with its start point.
+        # Each lane has a list of links. A link consists of two lanes that follow each other, and
+        # the edge from the end of the first one to the start of the second one, with its start
+        # point.
         self._links: list[list[tuple[int, int, tuple[int, Edge]]]] = []
         for lane_links in links:
             link_edges: list[tuple[int, int, tuple[int, Edge]]] = []
@@ -104,20 +108,20 @@ class LanePaths:
             3-D line strings in the map frame, at most ``MAX_PATHS``. (paths,)
 
         Raises:
-            ValueError: If there are more paths.
+            ValueError: If there are more than ``MAX_PATHS`` paths.
         """
         key = tuple(lanes)
         if key == self._last_key:
-            return self._last_lines
+            return self._last_lines  # at first, no lines for no lanes
         graph = self._subgraph(key)
-        targets: set[int] = set()
+        targets: set[int] = set()  # nodes with an incoming edge
         for edges in graph.values():
             for _, end in edges:
                 targets.add(end)
         paths: list[list[int]] = []
         for node, edges in graph.items():
             if not edges or node in targets:
-                continue  # no path starts here
+                continue  # no path starts at a node without outgoing or with incoming edges
             for path in _paths_from(node, graph):
                 paths.append(path)
                 if len(paths) > MAX_PATHS:
@@ -125,6 +129,7 @@ class LanePaths:
                         f"the lanes of one frame allow more than {MAX_PATHS} paths: the lane graph "
                         "is damaged."
                     )
+        # All lines are created in one call, from the nodes of all paths and the path of each node.
         nodes: list[int] = []
         path_of_node: list[int] = []
         for path_index, path in enumerate(paths):
@@ -137,9 +142,13 @@ class LanePaths:
         return self._last_lines
 
     def _subgraph(self, lanes: Sequence[int]) -> dict[int, list[Edge]]:
-        """Edges that leave each node in the graph of some lanes, in the order of the lanes."""
+        """Edges that leave each node in the graph of some lanes, in the order of the lanes.
+
+        The order of the edges determines the order of the paths.
+        """
         members = set(lanes)
-        graph: dict[int, dict[Edge, None]] = {}  # the inner dictionaries are used as ordered sets
+        # The inner dictionaries are used as ordered sets: an edge of two lanes is in it once.
+        graph: dict[int, dict[Edge, None]] = {}
         for lane in lanes:
             edges = list(self._edges[lane])
             for before, after, link in self._links[lane]:
@@ -148,19 +157,21 @@ class LanePaths:
             for start, edge in edges:
                 _, end = edge
                 graph.setdefault(start, {})[edge] = None
-                graph.setdefault(end, {})
+                graph.setdefault(end, {})  # the end may have no edges
         return {node: list(edges_of_node) for node, edges_of_node in graph.items()}
 
 
 def _fold_points(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge]]:
-    """Edges of a lane between its ends and the nodes that it shares; other points are on the edges.
+    """Edges of a lane between its ends and the nodes that it shares with other lanes.
+
+    The other points are on the way of the edges. A point that a lane visits twice is a node, too.
 
     Args:
         nodes: Points of the lane, as indices.
         uses: Number of vertices at each point of the map. (nodes,)
 
     Returns:
-        Start node of each edge, and the edge.
+        Start node of each edge, and the edge, in the direction of the lane.
     """
     edges: list[tuple[int, Edge]] = []
     start = nodes[0]
@@ -177,7 +188,10 @@ def _fold_points(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge
 
 
 def _next_edge(edges: Iterator[Edge], visited: set[int]) -> Edge | None:
-    """Take edges from an iterator up to the first one that ends at an unvisited node, or None."""
+    """Return the next edge of an iterator that ends at an unvisited node; None if there is none.
+
+    The iterator keeps its position, so the next call continues after this edge.
+    """
     for edge in edges:
         _, end = edge
         if end not in visited:
@@ -188,7 +202,7 @@ def _next_edge(edges: Iterator[Edge], visited: set[int]) -> Edge | None:
 def _paths_from(source: int, graph: dict[int, list[Edge]]) -> Iterator[list[int]]:
     """Yield the nodes of every simple path from a node to a node without outgoing edges.
 
-    This is a depth-first search with an explicit stack.
+    This is a depth-first search with an explicit stack, as recursion has a limited depth.
     """
     path = [source]
     visited = {source}
@@ -198,7 +212,7 @@ def _paths_from(source: int, graph: dict[int, list[Edge]]) -> Iterator[list[int]
         length, node, edges = stack[-1]
         del path[length:]  # go back to the node
         edge = _next_edge(edges, visited)
-        if edge is None:
+        if edge is None:  # all edges of the node have been tried
             stack.pop()
             visited.discard(node)
             continue

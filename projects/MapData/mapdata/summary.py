@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from gsmap.datasets.annotations.record import MapSample
 
-_EXAMPLES = 3  # number of places that the summary names for each reason
+_EXAMPLES = 3  # largest number of examples that the summary names for each reason
 
 
 @dataclass
@@ -16,9 +16,9 @@ class ConversionSummary:
         classes: Classes of map elements, in label order.
         samples: Number of samples by split.
         instances: Number of map elements by class.
-        problems: Number of omissions by their reason. Samples without any map element are counted
-            here as well, although they are kept.
-        examples: The first few places of the omissions, by their reason.
+        problems: Number of omissions (samples or map elements that are left out) by their reason.
+            Samples without any map element are counted here as well, although they are kept.
+        examples: The first few omissions, such as tokens of samples, by their reason.
         notes: Further lines of the summary.
     """
 
@@ -30,7 +30,11 @@ class ConversionSummary:
     notes: list[str] = field(default_factory=list)
 
     def add_sample(self, split: str, sample: MapSample) -> None:
-        """Count a sample of an annotation file, and its map elements."""
+        """Count a sample of an annotation file, and its map elements.
+
+        ``sample.instances`` is None for a sample without ground truth, and empty for ground truth
+        without any element.
+        """
         self.samples[split] += 1
         for instance in sample.instances or []:
             self.instances[self.classes[instance.label]] += 1
@@ -42,8 +46,8 @@ class ConversionSummary:
 
         Args:
             reason: Description of the kind of omission.
-            where: Place of the omission, such as a token; the first few are listed as examples.
-            count: Number of omissions at this place.
+            where: Name of the omission, such as a token; the first few are listed as examples.
+            count: Number of omissions under this name.
         """
         self.problems[reason] += count
         if len(self.examples[reason]) < _EXAMPLES:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from minicity.curves import Array
 
 RATE_HZ = 50  # messages per second
-STEP_S = 0.02  # finite differences use the poses this long before and after a message
+STEP_S = 0.02  # finite differences use the poses this many seconds before and after a message
 GRAVITY = 9.81  # m / s^2
 
 
@@ -24,8 +24,9 @@ def pose_messages(
         duration_s: Duration of the drive in seconds.
 
     Returns:
-        Messages with position and orientation in the world, and velocity, acceleration (gravity
-        included) and rotation rate in the car's frame, by central differences.
+        Messages with the timestamp ``utime`` in microseconds, position in metres and orientation
+        (w, x, y, z) in the world. Velocity in m / s, acceleration in m / s^2 (gravity included) and
+        rotation rate in rad / s are in the car's frame, by central differences.
     """
     # `arange` excludes its limit, which therefore lies half a period after the end of the drive.
     times = np.arange(-0.1, duration_s + 0.5 / RATE_HZ, 1.0 / RATE_HZ)
@@ -35,9 +36,9 @@ def pose_messages(
     car_from_world = np.swapaxes(now[:, :3, :3], 1, 2)  # the inverse of a rotation: its transpose
     velocity = (after[:, :3, 3] - before[:, :3, 3]) / (2 * STEP_S)
     second_derivative = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / STEP_S**2
-    # An accelerometer at rest measures the acceleration of gravity, upwards.
+    # An accelerometer at rest measures the acceleration of gravity, upwards: along z of the world.
     acceleration = second_derivative + np.array([0.0, 0.0, GRAVITY])
-    # Rotation of the car from before to after, in the car's frame.
+    # Rotation of the car from before to after, in the car's frame: inverse(before) @ after.
     rotation = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
     quaternions = Rotation.from_matrix(now[:, :3, :3]).as_quat()  # x, y, z, w
     fields = {

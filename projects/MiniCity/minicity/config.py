@@ -9,8 +9,10 @@ from gsmap.utils.errors import InputError
 
 VERSION = "v1.0-trainval"  # folder of the tables, as in nuScenes
 FORMAT = 1  # version of the generator's output
+# Names of places in nuScenes. Training and validation towns have different ones.
 TRAIN_LOCATIONS = ("singapore-onenorth", "singapore-hollandvillage", "singapore-queenstown")
 VAL_LOCATIONS = ("boston-seaport",)
+# Numbers of names of scenes in the official split of nuScenes. Each pass of a scene needs a name.
 MAX_TRAIN_SCENES = 700
 MAX_VAL_SCENES = 150
 MAX_PASSES = 20
@@ -31,7 +33,7 @@ class MiniCityConfig:
         passes: Number of drives (passes) through every scene, in [1, 20].
         repainted: Share of the streets that are repainted between two passes, in [0, 1].
         new_passes: Number of passes after the repainting, at least 1, and at most ``passes - 1`` if
-            there are several passes.
+            there are several passes. With one pass, it must be 1 and has no effect.
 
     Raises:
         ValueError: If a value is out of range.
@@ -105,6 +107,7 @@ class MiniCityConfig:
     def as_dict(self) -> dict:
         """All values and the format version of the generator, as a dictionary for JSON.
 
+        The dictionary identifies a data set: a folder is complete if its dictionary is equal.
         ``passes``, ``repainted`` and ``new_passes`` are left out if they have their default values.
         """
         values = {"format": FORMAT, **asdict(self), "val_scenes": self.num_val}
@@ -137,16 +140,17 @@ epoch may be chosen by it. It has a single training scene because the format req
 
 def _digest(parts: tuple) -> bytes:
     """Hash of 16 bytes of some values, converted to text."""
-    text = "|".join(map(str, parts))
+    text = "|".join(map(str, parts))  # unlike Python's `hash`, equal in every process
     return hashlib.blake2b(text.encode(), digest_size=16).digest()
 
 
 def make_rng(*parts: object) -> np.random.Generator:
     """Make a random generator whose state depends on ``parts`` alone, in every process."""
-    words = np.frombuffer(_digest(parts), dtype=np.uint32)
+    words = np.frombuffer(_digest(parts), dtype=np.uint32)  # four integers as the seed
     return np.random.default_rng(words.tolist())
 
 
 def make_token(*parts: object) -> str:
     """Make a token of 32 hexadecimal digits, as in nuScenes, that depends on ``parts`` alone."""
+    # The first word keeps tokens apart from the seeds of `make_rng`.
     return _digest(("token", *parts)).hex()

@@ -1,4 +1,7 @@
-"""Description of the ground for the renderer: surfaces, kerbs, paint and height."""
+"""Description of the ground for the renderer: surfaces, kerbs, paint and height.
+
+The functions at the end compute the outlines of painted areas for `Marking`.
+"""
 
 from dataclasses import dataclass, field
 
@@ -27,7 +30,7 @@ class Surface:
     Attributes:
         polygon: Outline and holes in the world, in metres.
         material: Key of ``MATERIALS``, which has the colours.
-        tone: Brightness relative to the colour in ``MATERIALS``.
+        tone: Factor of the colour in ``MATERIALS``; the result is limited to 255.
     """
 
     polygon: Polygon
@@ -52,11 +55,11 @@ class Marking:
 
 @dataclass(frozen=True)
 class HeightGrid:
-    """Ground height on a regular grid. A point outside has the height of the nearest cell.
+    """Ground height on a regular grid. A point outside the grid has the height of the nearest cell.
 
     Attributes:
         origin: World x, y of the centre of cell (0, 0), in metres. (2,)
-        cell_m: Edge of a cell in metres.
+        cell_m: Side of a cell in metres.
         height_m: Height of each cell in metres, rows along y, columns along x. (rows, columns)
 
     Raises:
@@ -107,6 +110,7 @@ def solid_line(line: Array, width_m: float) -> list[Array]:
     Returns:
         One outline (2n, 2), or none for a line of at most 5 cm.
     """
+    # The last arc length is the length of the line. `strip` takes half the width.
     if len(line) > 1 and arc_lengths(line)[-1] > 0.05:
         return [strip(line, width_m / 2)]
     return []
@@ -122,10 +126,10 @@ def dashed_line(line: Array, width_m: float, dash_m: float, gap_m: float) -> lis
         gap_m: Length between two dashes in metres.
 
     Returns:
-        One outline per dash. Each (m, 2)
+        One outline per dash, none for a line of at most 0.3 m. Each (m, 2)
     """
     total = float(arc_lengths(line)[-1]) if len(line) > 1 else 0.0
-    # A dash begins at least 0.3 m before the end of the line.
+    # A dash begins more than 0.3 m before the end of the line, so that the last one is not a dot.
     starts = np.arange(0.0, max(total - 0.3, 0.0), dash_m + gap_m)
     outlines = []
     for start in starts:
@@ -140,14 +144,15 @@ def double_line(line: Array, width_m: float, gap_m: float) -> list[Array]:
     Args:
         line: Middle between the two lines, in metres. (n, 2)
         width_m: Width of each line in metres.
-        gap_m: Distance between the two lines in metres.
+        gap_m: Bare space between the two lines in metres.
 
     Returns:
         The left and the right outline, or none for fewer than two points. Each (2n, 2)
     """
     if len(line) < 2:
         return []
-    # `strip` returns n points of the left side, then n points of the right side in reverse order.
+    # `strip` returns n points of the left side, then n points of the right side in reverse order,
+    # so the halves are the two sides.
     outer_left, outer_right = np.split(strip(line, gap_m / 2 + width_m), 2)
     inner_left, inner_right = np.split(strip(line, gap_m / 2), 2)
     # Each outline goes along its outer side and returns along its inner side.
@@ -158,6 +163,8 @@ def double_line(line: Array, width_m: float, gap_m: float) -> list[Array]:
 
 def zebra(side_a: Array, side_b: Array, stripe_m: float = 0.5, gap_m: float = 0.5) -> list[Array]:
     """Stripes of a crossing, parallel to the traffic.
+
+    The stripes run from one long side to the other and are lined up from kerb to kerb.
 
     Args:
         side_a: One long side of the crossing, kerb to kerb, in metres. (n, 2)
@@ -171,12 +178,14 @@ def zebra(side_a: Array, side_b: Array, stripe_m: float = 0.5, gap_m: float = 0.
     lengths_a = arc_lengths(side_a)
     lengths_b = arc_lengths(side_b)
     total = float(lengths_a[-1])
+    # At least one stripe; 0.3 m of the length remain free.
     count = max(1, int((total - 0.3) / (stripe_m + gap_m)))
     # The stripes, with gaps between them, are centred between the kerbs.
     first = (total - count * (stripe_m + gap_m) + gap_m) / 2
     stripes = []
     for k in range(count):
         start = first + k * (stripe_m + gap_m)
+        # Both edges of the stripe, as shares of the length, because the sides may differ in length.
         shares = np.array([start, start + stripe_m]) / total
         edge_a = _points_at_shares(side_a, lengths_a, shares)
         edge_b = _points_at_shares(side_b, lengths_b, shares)
@@ -186,7 +195,13 @@ def zebra(side_a: Array, side_b: Array, stripe_m: float = 0.5, gap_m: float = 0.
 
 
 def _points_at_shares(line: Array, lengths: Array, shares: Array) -> Array:
-    """Points of a polyline (n, 2) at shares (k,) of its length, in [0, 1]. (k, 2)"""
+    """Points of a polyline (n, 2) at shares (k,) of its length, in [0, 1]. (k, 2)
+
+    Args:
+        line: Vertices in metres. (n, 2)
+        lengths: Arc length at each vertex, in metres. (n,)
+        shares: Shares of the length of the polyline. (k,)
+    """
     arc_m = shares * lengths[-1]
     x = np.interp(arc_m, lengths, line[:, 0])
     y = np.interp(arc_m, lengths, line[:, 1])

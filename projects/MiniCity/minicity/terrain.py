@@ -1,7 +1,9 @@
 """Intersections of a camera's rays with uneven ground.
 
 The ray of a pixel is followed over the ground in a vertical plane. The height of the ground is
-sampled at ``RINGS`` fixed distances from the camera, for a part of the image columns.
+sampled at ``RINGS`` fixed distances from the camera, for a part of the image columns. The image row
+of each sample gives a first estimate of the distance at which the ray of a pixel meets the ground.
+Newton's method refines it.
 """
 
 from dataclasses import dataclass
@@ -15,10 +17,10 @@ from minicity.camera import NEAR_M, Camera
 from minicity.curves import Array
 from minicity.scene_map import HeightGrid
 
-COLUMNS_PER_PICTURE = 100
+COLUMNS_PER_PICTURE = 100  # largest number of intervals between sampled image columns
 NEAREST_M, FARTHEST_M = 0.7, 160.0  # range of the distances of height samples
 RINGS = 224  # number of distances
-NEWTON_STEPS = 2
+NEWTON_STEPS = 2  # steps that refine a distance
 _ROW = 1024  # number of points that `sample_height` puts into a row
 
 
@@ -34,7 +36,8 @@ def sample_height(grid: HeightGrid, points: Array) -> Array:
     """
     cells = ((points - grid.origin) / grid.cell_m).reshape(-1, 2).astype(np.float32)
     count = len(cells)
-    # cv2.remap accepts no side longer than 32767, so the list of points is folded into rows.
+    # cv2.remap interpolates a raster at given columns and rows. It accepts no side longer than
+    # 32767, so the list of points is folded into rows.
     rows = -(-count // _ROW)  # rounded up
     folded = np.zeros((rows, _ROW, 2), dtype=np.float32)
     folded.reshape(-1, 2)[:count] = cells
@@ -53,10 +56,12 @@ def sample_height(grid: HeightGrid, points: Array) -> Array:
 class Terrain:
     """Uneven ground in the view of one camera, at about a hundred of its image columns.
 
+    `make_terrain` creates it.
+
     Attributes:
         camera: The camera.
         grid: Height of the ground.
-        columns: Image columns in pixels. (c,)
+        columns: Image columns in pixels, ascending, from the first to the last one. (c,)
         distances_m: Horizontal distances of the height samples in metres, ascending. (RINGS,)
         skyline_rows: Image row of the skyline of the ground up to each distance, in pixels. It is
             the topmost row that shows this ground, so it never increases with the distance.
@@ -82,7 +87,8 @@ class Terrain:
         Returns:
             Distances in metres; about ``FARTHEST_M`` for rays above the skyline. (h, c)
         """
-        reach = np.empty((len(rows), len(self.columns)))
+        reach = np.empty((len(rows), len(self.columns)))  # estimate of the distances, (h, c)
+        # The first estimate is the distance at which the skyline reaches the row of the pixel.
         # Rows decrease with the distance. np.interp needs increasing rows, so both are reversed.
         for i, profile in enumerate(self.skyline_rows.T):
             reach[:, i] = np.interp(rows, profile[::-1], self.distances_m[::-1])
@@ -95,7 +101,8 @@ class Terrain:
             ahead = sample_height(self.grid, eye[:2] + (reach + step)[..., None] * direction)
             above = eye[2] + reach * rise - here  # height of the ray above the ground
             closing = rise - (ahead - here) / step  # derivative of `above` by the distance
-            # `closing` is kept away from 0, and the distance changes by at most a tenth.
+            # `closing` is kept away from 0 (nearly parallel to the ground), and the distance
+            # changes by at most a tenth, so that a step stays near the estimate.
             move = -above / np.where(np.abs(closing) < 1e-3, -1e-3, closing)
             move = np.clip(move, -0.1 * reach, 0.1 * reach)
             reach = np.clip(reach + move, 0.1, FARTHEST_M)
@@ -127,10 +134,11 @@ class Terrain:
             Horizontal unit directions, (h, c, 2), and the rise per horizontal metre, (h, c), which
             is negative if the ray descends.
         """
-        u, v = np.meshgrid(self.columns, rows)
+        u, v = np.meshgrid(self.columns, rows)  # pixel coordinates, (h, c) each
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ self.camera.world_from_pixel.T
-        level = np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-9)  # horizontal length
-        return rays[..., :2] / level[..., None], rays[..., 2] / level
+        # Horizontal length of each ray; 1e-9 avoids a division by 0 for vertical rays.
+        level_length = np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-9)
+        return rays[..., :2] / level_length[..., None], rays[..., 2] / level_length
 
 
 def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
@@ -153,7 +161,9 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
         raise InputError(f"the picture must be at least 2 pixels wide, got {camera.width}.")
     columns = np.linspace(0.0, last, num=min(last, COLUMNS_PER_PICTURE) + 1)
     distances = np.geomspace(NEAREST_M, FARTHEST_M, num=RINGS)
-    # The ground of a column is sampled in the direction of one of its pixels below the middle.
+    # The ground of a column is sampled in the direction of one of its pixels below the middle of
+    # the image, where most pixels of the ground are. `middle` are these pixels as (u, v, 1), (3,
+    # c).
     middle = np.stack([columns, np.full_like(columns, 0.65 * camera.height), np.ones_like(columns)])
     rays = (camera.world_from_pixel @ middle)[:2].T
     direction = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
@@ -164,7 +174,8 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
     # Points behind the camera are replaced by a point in front of it, whose row is not used.
     rows = camera.to_pixels(np.where(in_front[..., None], points_cam, [0.0, 0.0, 1.0]))[..., 1]
     # Ground that is behind the camera or far below the image gets rows below the image. These rows
-    # decrease with the distance, because `Terrain.distances` interpolates between them.
+    # decrease with the distance, because `Terrain.distances` interpolates between them. The running
+    # minimum below makes all rows decrease: ground behind a crest gets the row of the crest.
     below_image = 10.0 * camera.height + 10.0 * np.geomspace(1.0, 0.1, num=RINGS)[:, None]
     rows = np.where(in_front, np.minimum(rows, below_image), below_image)
     return Terrain(
@@ -194,7 +205,11 @@ class Footprints:
 
 
 def terrain_footprints(terrain: Terrain) -> Footprints:
-    """Compute the footprints of the image rows on uneven ground, as medians over the columns."""
+    """Compute the footprints of the image rows on uneven ground, as medians over the columns.
+
+    The width of a pixel on the ground is the distance divided by the focal length in pixels. A row
+    is visible if it is below the highest point of the skyline.
+    """
     camera = terrain.camera
     edges = terrain.distances(np.arange(camera.height + 1) - 0.5)  # upper edges of rows (H + 1, c)
     distance = np.median(edges[:-1], axis=1)

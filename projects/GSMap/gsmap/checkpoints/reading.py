@@ -119,13 +119,17 @@ def _remedy_for(path: object, default: str) -> str:
     Args:
         path: File or address of the checkpoint.
         default: Remedy for other files and for addresses.
+
+    Returns:
+        The remedy without a period at its end.
     """
+    default = default.rstrip(".")
     file_path = Path(str(path))
     if not file_path.is_file():
         return default
     with file_path.open("rb") as file:
         # The caller appends the period of the sentence.
-        return fetch_advice(file.read(100), default.rstrip("."))
+        return fetch_advice(file.read(100), default)
 
 
 def _exceeds_file_size(error: BaseException, path: Path) -> bool:

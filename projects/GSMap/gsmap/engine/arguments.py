@@ -31,8 +31,9 @@ class _OptionAction(argparse.Action):
         earlier_overrides = dict(getattr(namespace, "cfg_options", None) or {})
         earlier_value = getattr(namespace, self.dest, None)
         if earlier_value is not None:  # the option is given twice, and the last value counts
-            for key in self._overrides(earlier_value):
-                earlier_overrides.pop(key, None)
+            for key, value in self._overrides(earlier_value).items():
+                if earlier_overrides.get(key) == value:
+                    del earlier_overrides[key]
         setattr(namespace, self.dest, values)
         namespace.cfg_options = {**self._overrides(values), **earlier_overrides}
 

@@ -1,4 +1,8 @@
-"""Training targets of a config: their transforms, and the settings shared with the head."""
+"""Transforms of the training pipeline that compute targets, and the settings they share with heads.
+
+A step is an entry of a pipeline in a config: a dictionary with the ``type`` of a transform and its
+settings. Heads, losses and auxiliary heads name the transforms that they need (`NeedsTargets`).
+"""
 
 import inspect
 from collections.abc import Iterator
@@ -22,6 +26,8 @@ def share_settings(cfg: Config) -> None:
     Args:
         cfg: Config to change.
     """
+    # Steps are searched everywhere outside of the model, because configs nest pipelines in loaders,
+    # data set wrappers and variables.
     sections = [value for key, value in cfg.items() if key != "model"]
     for head in _heads(cfg):
         head_settings = _target_settings(head)
@@ -30,9 +36,9 @@ def share_settings(cfg: Config) -> None:
         transform_names = _class_with_targets(head.get("type")).transforms
         for step in _find_steps(sections, names=transform_names):
             transform = class_of_type(step["type"], registry=TRANSFORMS)
-            parameters = _defaults(transform)
+            optional_names = _defaults(transform).keys()
             for name, value in head_settings.items():
-                if name in parameters and name not in step:
+                if name in optional_names and name not in step:
                     step[name] = value
 
 
@@ -52,7 +58,7 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
 
 
 def _target_settings(head: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of transforms that follow from the config of a head."""
+    """Return the settings of transforms that follow from the config of a head; empty for none."""
     # Typed as Any, because the cached function `_defaults` needs a hashable argument, and mypy does
     # not accept the class of a protocol as hashable.
     head_class: Any = _class_with_targets(head.get("type"))
@@ -63,7 +69,10 @@ def _target_settings(head: dict[str, Any]) -> dict[str, Any]:
 
 
 def _heads(cfg: Config) -> list[dict[str, Any]]:
-    """Return the head of a config, followed by the first-stage head of a two-stage model."""
+    """Return the head of a config, followed by the first-stage head of a two-stage model.
+
+    A two-stage head contains its first-stage head as the setting ``detector``.
+    """
     head = (cfg.get("model") or {}).get("map_head")
     if not isinstance(head, dict):
         return []
@@ -99,7 +108,7 @@ def _defaults(cls: type | None) -> dict[str, Any]:
     defaults: dict[str, Any] = {}
     if cls is None:
         return defaults
-    for base in reversed(cls.__mro__):
+    for base in reversed(cls.__mro__):  # base classes first, so that subclasses override them
         constructor = vars(base).get("__init__")
         if constructor is None:
             continue
@@ -110,7 +119,7 @@ def _defaults(cls: type | None) -> dict[str, Any]:
 
 
 def _tuples_to_lists(value: Any) -> Any:
-    """Convert tuples in a nested setting to lists."""
+    """Convert tuples in a nested setting to lists, so that both compare as equal."""
     if isinstance(value, list | tuple):
         return [_tuples_to_lists(item) for item in value]
     return value
@@ -121,6 +130,7 @@ def needed_targets(cfg: Config) -> dict[str, Any]:
 
     Returns:
         For each transform, by its name, the type of the head, loss or auxiliary head that needs it.
+        If several need the transform, the last of them is named.
     """
     heads = _heads(cfg)
     parts: list[Any] = list(heads)
@@ -152,18 +162,18 @@ def class_of_type(kind: Any, registry: Registry = MODELS) -> type | None:
     """Return the class of the ``type`` in a config, or None if there is no such class.
 
     Args:
-        kind: Class, or name of a class.
-        registry: Registry of the names.
+        kind: Value of ``type``: a class, or the name of a class.
+        registry: Registry in which names are looked up.
     """
     cls = registry.get(kind) if isinstance(kind, str) else kind
     return cls if isinstance(cls, type) else None
 
 
 def check_targets(cfg: Config) -> None:
-    """Check that the training pipeline has the transforms of `needed_targets`.
+    """Check that the training pipeline of each data set has the transforms of `needed_targets`.
 
     Raises:
-        ValueError: If a transform is missing, or its settings contradict the head.
+        ValueError: If a transform is missing, or a setting of a transform contradicts the head.
     """
     dataset = (cfg.get("train_dataloader") or {}).get("dataset") or {}
     for steps in _pipelines(dataset):
@@ -184,6 +194,7 @@ def check_targets(cfg: Config) -> None:
 def _pipelines(dataset: dict[str, Any]) -> list[list[Any]]:
     """Return the pipeline of each data set in a config, followed by the steps of its wrappers.
 
+    A wrapper is a data set around another one (``dataset``) or around several (``datasets``).
     Without a data set, the result is empty.
     """
     steps = list(dataset.get("pipeline") or ())

@@ -1,4 +1,8 @@
-"""Choice between plain torch and fused kernels, and registration of the kernels with torch."""
+"""Choice between plain torch and fused kernels, and registration of the kernels with torch.
+
+A fused kernel is a compiled function that computes a whole operation. Its backend is ``"cpu"``
+(compiled by numba) or ``"triton"`` (for GPUs). The backend ``"reference"`` is plain torch.
+"""
 
 import os
 import warnings
@@ -13,6 +17,7 @@ from torch.library import CustomOpDef, custom_op
 
 from gsmap.utils.errors import InputError
 
+# Package of each backend, which is also the name of the module with its kernels in `gsmap.ops`.
 PACKAGES = {"cpu": "numba", "triton": "triton"}
 DEVICES = {"cpu": "cpu", "triton": "cuda"}
 INSTALLED = {backend: find_spec(package) is not None for backend, package in PACKAGES.items()}
@@ -31,7 +36,7 @@ TRITON_KERNELS = {
     "soft_rasters": True,
 }
 SWITCH = "GSMAP_TRITON_KERNELS"  # environment variable: further kernels for "auto", or "all"
-# Triton kernels that are not deterministic, because atomics add their gradients in any order.
+# Triton kernels with gradients that are not deterministic, because atomics add them in any order.
 UNORDERED = ("deformable_sample", "sample_kernels")
 
 
@@ -71,9 +76,10 @@ def choose_backend(
     Args:
         backend: Name of a backend, or ``"auto"``. The latter selects the fused kernels for the
             device and type of the tensor, or the reference in plain torch if there are none.
+            Fused kernels compute in float32 only.
         tensor: Input of the operation, whose device and type determine the backend.
         fused: Backends for which the operation has fused kernels: ``"cpu"`` (numba), ``"triton"``.
-        kernel: Name of the function in ``TRITON_KERNELS``, if it has a Triton kernel.
+        kernel: Name of the function in ``TRITON_KERNELS``; empty without a Triton kernel.
 
     Returns:
         ``"reference"``, ``"cpu"`` or ``"triton"``.
@@ -104,6 +110,7 @@ def choose_backend(
             f"backend 'triton' of {kernel} adds gradients up in any order: use 'reference' with "
             "torch.use_deterministic_algorithms."
         )
+    # Triton's interpreter runs kernels on the CPU, for tests and debugging.
     interpreted = backend == "triton" and os.environ.get("TRITON_INTERPRET") == "1"
     if tensor.device.type != DEVICES[backend] and not interpreted:
         raise InputError(f"backend {backend!r} does not serve tensors on {tensor.device}.")
@@ -111,7 +118,10 @@ def choose_backend(
 
 
 def _automatic_backend(fused: Collection[str], tensor: Tensor) -> str:
-    """Return the installed fused backend for a tensor, or ``"reference"``."""
+    """Return the installed fused backend for a tensor, or ``"reference"``.
+
+    Warns if numba is missing, because plain torch is much slower on a CPU.
+    """
     candidates = [name for name in fused if DEVICES[name] == tensor.device.type]
     if tensor.dtype != torch.float32 or not candidates:
         return "reference"
@@ -119,10 +129,10 @@ def _automatic_backend(fused: Collection[str], tensor: Tensor) -> str:
         warnings.warn(
             "numba is not installed: rasters are computed by the slow reference. "
             "Install it with `pip install numba`.",
-            stacklevel=3,
+            stacklevel=3,  # names the line that called `choose_backend`
         )
-    first = candidates[0]
-    return first if INSTALLED[first] else "reference"
+    candidate = candidates[0]  # the only one, because each backend has another device
+    return candidate if INSTALLED[candidate] else "reference"
 
 
 def fused_operator(
@@ -146,7 +156,8 @@ def fused_operator(
             gradients.
         arguments: Arguments of the function in the syntax of a torch schema, tensors first. The
             operator takes the backend as a further, last argument.
-        shape: Function from the arguments to the shape of the output.
+        shape: Function from the arguments to the shape of the output, by which torch.compile knows
+            the output without a call of the kernel.
         differentiable: Number of tensors, from the first one, that have gradients.
         dtype: Type of the output; None for the type of the first tensor.
 
@@ -166,7 +177,7 @@ def fused_operator(
         return kernel(*inputs[:-1])
 
     def fake_forward(*inputs: Any) -> Tensor:
-        return inputs[0].new_empty(shape(*inputs[:-1]), dtype=dtype)
+        return inputs[0].new_empty(shape(*inputs[:-1]), dtype=dtype)  # None: type of the input
 
     schema = f"({arguments}, str backend) -> Tensor"
     operator = custom_op(f"gsmap::{function}", forward, mutates_args=(), schema=schema)
@@ -188,7 +199,7 @@ def fused_operator(
 
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.save_for_backward(*inputs[:num_tensors])
-        ctx.settings = inputs[num_tensors:]
+        ctx.settings = inputs[num_tensors:]  # arguments that are no tensors, and the backend
 
     def differentiate(ctx: Any, grads: Tensor) -> tuple[Any, ...]:
         gradients = gradient(grads, *ctx.saved_tensors, *ctx.settings)

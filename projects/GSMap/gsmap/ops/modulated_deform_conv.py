@@ -21,8 +21,8 @@ def modulated_deform_conv(
 ) -> Tensor:
     """Convolve images with filters whose taps are shifted and weighted at each output pixel.
 
-    The results equal mmcv's operator. A tap is an entry of a filter. Images are zero outside of
-    their borders.
+    A tap is an entry of a filter. Each tap reads the image at its shifted position by bilinear
+    interpolation, and images are zero outside of their borders. The results equal mmcv's operator.
 
     Args:
         images: Input images. (B, C, H, W)
@@ -43,11 +43,11 @@ def modulated_deform_conv(
     batch, _, *size = images.shape
     out_size = offset.shape[2:]  # (h, w)
     num_taps = weight.shape[2] * weight.shape[3]
-    # Along rows and along columns, (B, G, K, h, w) each, with G = deform_groups.
+    # Shifts along rows and along columns, (B, G, K, h, w) each, with G = deform_groups.
     shifts = offset.unflatten(1, (deform_groups, num_taps, 2)).unbind(3)
     tap_rows = torch.arange(weight.shape[2], device=images.device)
     tap_cols = torch.arange(weight.shape[3], device=images.device)
-    taps = torch.meshgrid(tap_rows, tap_cols, indexing="ij")
+    taps = torch.meshgrid(tap_rows, tap_cols, indexing="ij")  # row and column of each tap
     coordinates = []  # the row coordinates of the samples, then their column coordinates
     shapes = ((-1, 1), (1, -1))  # the row starts as (h, 1), and the column starts as (1, w)
     for axis, (shift, tap) in enumerate(zip(shifts, taps, strict=True)):
@@ -58,8 +58,9 @@ def modulated_deform_conv(
         coordinates.append((2 * pixels + 1) / size[axis] - 1)
     rows, cols = coordinates
     locations = torch.stack([cols, rows], dim=-1).flatten(0, 1).flatten(1, 2)  # (B G, K h, w, 2)
-    parts = images.reshape(batch * deform_groups, -1, size[0], size[1])
-    samples = F.grid_sample(parts, locations, align_corners=False)  # (B G, C / G, K h, w)
+    # Each group of channels becomes a separate image, because its taps have other locations.
+    group_images = images.reshape(batch * deform_groups, -1, size[0], size[1])
+    samples = F.grid_sample(group_images, locations, align_corners=False)  # (B G, C / G, K h, w)
     samples = samples.view(batch, deform_groups, -1, num_taps, out_size[0], out_size[1])
     samples = samples * mask.unflatten(1, (deform_groups, 1, num_taps))
     # The inputs of each output pixel, as from `F.unfold`. (B, groups, C / groups * K, h w)

@@ -1,4 +1,7 @@
-"""Map priors of several places: maps of the predictions of earlier drives."""
+"""Map priors of several places: maps of the predictions of earlier drives.
+
+A window is the part of a map in the range of a frame. Maps are read and written by windows.
+"""
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -27,7 +30,7 @@ class Place(NamedTuple):
     Attributes:
         token: Name of the frame's sample.
         name: Name of the town or map; empty if it is unknown.
-        scene: Name of the scene.
+        scene: Name of the scene; empty if it is unknown.
         pose: Transform from the annotation frame to the world in metres. (4, 4)
     """
 
@@ -72,6 +75,7 @@ class PlaceMaps:
 
     Attributes:
         memories: Valid values of ``memory``.
+        writes: Whether `write` changes the maps.
 
     Raises:
         ValueError: If ``memory`` is unknown, or the cells are not square.
@@ -98,7 +102,9 @@ class PlaceMaps:
         self.rule = rule
         self.memory = memory
         self.writes = memory != "none"
+        # Rounded, because the extent divided by the number of cells may be 0.30000000000000004.
         self.cell_m = round(width_m, 6)
+        # Maps by the names of `_key`, the oldest first.
         self._priors: OrderedDict[str, AnyPrior] = OrderedDict()
 
     def settings_of(self, name: str) -> PriorSettings:
@@ -114,9 +120,9 @@ class PlaceMaps:
         key = self._key(place)
         if key not in self._priors:
             if self.memory == "scene" and len(self._priors) >= _MOST_SCENES:
-                _, oldest = self._priors.popitem(last=False)
+                _, oldest = self._priors.popitem(last=False)  # the map that was created first
                 if isinstance(oldest, MapPrior):
-                    oldest.close()
+                    oldest.close()  # releases its memory
             self._priors[key] = MapPrior(self.settings_of(key), rule=self.rule)
         return self._priors[key]
 
@@ -133,7 +139,7 @@ class PlaceMaps:
             place: Place of the frame; None if it is unknown.
 
         Returns:
-            Values in [0, 1] on the host, 0 where nothing is known. (classes, H, W)
+            Values in [0, 1] on the CPU, 0 where nothing is known. (classes, H, W)
         """
         unknown = torch.zeros(len(self.classes), self.grid.height, self.grid.width)
         if place is None or self.memory == "none":
@@ -152,7 +158,7 @@ class PlaceMaps:
         """
         if place is not None and self.writes:
             prior = self.find_or_create(place)
-            assert isinstance(prior, MapPrior)  # GivenMaps refuses to write others
+            assert isinstance(prior, MapPrior)  # `GivenMaps` refuses other priors if it writes
             prior.write(place.pose, self.grid, values=raster)
 
 
@@ -163,7 +169,7 @@ class GivenMaps(PlaceMaps):
         priors: The priors.
         classes: Names of the classes.
         grid: Extent and cells of the window of a frame, the part of a map that is read and written.
-        update: Write each frame after it is predicted.
+        update: Whether to write each frame after it is predicted.
 
     Raises:
         ValueError: If there is no prior, a prior has other classes or cells, two priors are of one
@@ -184,16 +190,18 @@ class GivenMaps(PlaceMaps):
         for prior in priors:
             name = prior.settings.place
             expected = self.settings_of(name)
-            found = prior.settings
+            given = prior.settings
             if not isinstance(prior, MapPrior):
                 if update:
                     raise InputError(
                         f"the prior of {name!r} has {prior.content}, which a model can only read: "
                         "leave the update out; tools/build_map.py --prior builds a new one."
                     )
-                # These priors have no cells: they are drawn on the cells of a window.
-                found = replace(found, cell_m=expected.cell_m, tile_m=expected.tile_m)
-            expected.require_equal(found, f"the prior of {name!r}")
+                # These priors have no cells: they are drawn on the cells of a window. So the sizes
+                # of cells and tiles are not compared below.
+                given = replace(given, cell_m=expected.cell_m, tile_m=expected.tile_m)
+            # Compares classes, place, cells and tiles, and raises an error if one differs.
+            expected.require_equal(given, f"the prior of {name!r}")
             if name in self._priors:
                 raise InputError(f"two priors are of {name!r}: give one for each place.")
             self._priors[name] = prior
@@ -219,7 +227,7 @@ class GivenMaps(PlaceMaps):
         return self._priors[place.name]
 
     def find_or_create(self, place: Place) -> AnyPrior:
-        """Map at a place (`find`)."""
+        """Map at a place, as returned by `find`: no map is created."""
         return self.find(place)
 
     def require_place(self, place: Place | None) -> Place:
@@ -236,7 +244,7 @@ class GivenMaps(PlaceMaps):
         return place
 
     def read(self, place: Place | None) -> Tensor:
-        """Read the window of a frame.
+        """Read the window of a frame. (classes, H, W)
 
         Raises:
             ValueError: If the place of the frame is unknown, or has no map.

@@ -46,8 +46,8 @@ class PriorSettings:
         if not 0.01 <= self.cell_m <= 10:
             raise InputError(f"cell_m must be in [0.01, 10], got {self.cell_m}.")
         cells = self.tile_m / self.cell_m
-        is_whole = abs(cells - round(cells)) <= 1e-6  # the quotient is rounded
-        if not is_whole or not 1 <= round(cells) <= _MOST_TILE_CELLS:
+        is_possible = 0.5 < cells < _MOST_TILE_CELLS + 0.5
+        if not is_possible or abs(cells - round(cells)) > 1e-6:  # the quotient is rounded
             raise InputError(
                 f"tile_m must be 1 to {_MOST_TILE_CELLS} cells of {self.cell_m:g} m, got "
                 f"{self.tile_m:g} m."

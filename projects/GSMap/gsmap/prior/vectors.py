@@ -1,4 +1,8 @@
-"""Cells of a map prior that the lines and areas of a vector map cover."""
+"""Cells of a map prior that the lines and areas of a vector map cover.
+
+A prior is stored in tiles, squares of cells. Lines are cut into short pieces, and each piece is
+drawn only on the tiles that it may touch.
+"""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -18,7 +22,7 @@ from gsmap.structures.polylines import is_closed
 from gsmap.utils.errors import InputError
 
 _MOST_PIECES = 1_000_000  # largest number of pieces of lines and areas, in all tiles together
-_CHUNK = 64  # pieces of a tile that are drawn at a time
+_CHUNK = 64  # pieces of a tile that are drawn at a time, which bounds the memory
 _FARTHEST_M = 1e7  # largest coordinate of a vertex
 Piece = tuple[int, bool, FloatArray]
 """Class index, whether the piece is a filled area, and vertices in metres (n, 2)."""
@@ -29,22 +33,24 @@ def covered_cells(
 ) -> Iterator[tuple[TileKey, NDArray[np.bool_]]]:
     """Iterate over the tiles that a map touches, each with the cells that it covers.
 
-    Closed elements of `AREA_CLASSES` are filled. A cell is covered if at least half of its area is.
+    Closed elements of `AREA_CLASSES` are filled. A cell counts as covered if at least half of its
+    area is covered.
 
     Args:
         elements: Map in the global frame, in metres.
-        settings: Classes and cells of the prior.
+        settings: Classes, cells and tiles of the prior.
         width_m: Width of a line in metres, > 0.
 
     Returns:
         Column and row of each tile, and whether an element of each of the C classes covers each
-        cell, (C, tile_cells, tile_cells).
+        cell, (C, tile_cells, tile_cells). Tiles are in ascending order of column and row.
 
     Raises:
         ValueError: If a label or a vertex is out of range, or the map is too large.
     """
     num_classes = len(settings.classes)
-    if len(elements) and not 0 <= elements.labels.min() <= elements.labels.max() < num_classes:
+    is_unknown = (elements.labels < 0) | (elements.labels >= num_classes)
+    if is_unknown.any():
         raise InputError(f"labels of elements must be in [0, {num_classes}), the prior's classes.")
     if np.abs(elements.points[:, :2]).max(initial=0.0) > _FARTHEST_M:
         raise InputError(f"vertices must be within {_FARTHEST_M:g} m of the origin.")
@@ -53,6 +59,7 @@ def covered_cells(
     extent = (0.0, settings.tile_m)
     grid = BEVGrid(x_range=extent, y_range=extent, height=side, width=side)
     for key, pieces in sorted(pieces_of_tile.items()):
+        # Vertices are drawn relative to the tile's corner, so that float32 is precise enough.
         corner = settings.tile_m * np.array(key)
         covered = np.zeros((num_classes, side, side), dtype=np.bool_)
         for first in range(0, len(pieces), _CHUNK):
@@ -65,7 +72,9 @@ def covered_cells(
                 row[len(points) :] = points[-1] - corner
             filled = torch.tensor([is_filled for _, is_filled, _ in chunk])
             lines = torch.from_numpy(padded).float()
-            masks = draw_polylines(lines, grid, width_m=width_m, filled=filled).numpy() >= 0.5
+            # `draw_polylines` returns the share of each cell's area that a piece covers.
+            shares = draw_polylines(lines, grid, width_m=width_m, filled=filled)
+            masks = shares.numpy() >= 0.5
             for mask, (label, _, _) in zip(masks, chunk, strict=True):
                 covered[label] |= mask
         if covered.any():
@@ -75,7 +84,11 @@ def covered_cells(
 def _pieces_by_tile(
     elements: MapElements, settings: PriorSettings, width_m: float
 ) -> dict[TileKey, list[Piece]]:
-    """Distribute areas and short pieces of lines to the tiles that they may touch."""
+    """Distribute areas and short pieces of lines to the tiles that they may touch.
+
+    Raises:
+        ValueError: If there may be more than ``_MOST_PIECES`` pieces in all tiles.
+    """
     pieces_of_tile: dict[TileKey, list[Piece]] = defaultdict(list)
     num_pieces = 0
     for line, label, _ in elements.rows:
@@ -99,15 +112,17 @@ def _pieces_by_tile(
                 f"the map covers more than {_MOST_PIECES} tiles: its coordinates are no metres, or "
                 "it must be split."
             )
-        parts = [points]
+        shapes = [points]  # an area is not cut
         if not is_area:
-            parts = _short_segments(points, longest_m=settings.tile_m / 4)
-        for part in parts:
-            low = np.floor((part.min(axis=0) - width_m) / settings.tile_m).astype(int)
-            high = np.floor((part.max(axis=0) + width_m) / settings.tile_m).astype(int)
+            shapes = _short_segments(points, longest_m=settings.tile_m / 4)
+        for shape in shapes:
+            # First and last tile (column, row) of the bounding box, which is widened on each side
+            # because a drawn line has a width.
+            low = np.floor((shape.min(axis=0) - width_m) / settings.tile_m).astype(int)
+            high = np.floor((shape.max(axis=0) + width_m) / settings.tile_m).astype(int)
             for column in range(low[0], high[0] + 1):
                 for row in range(low[1], high[1] + 1):
-                    pieces_of_tile[column, row].append((label, is_area, part))
+                    pieces_of_tile[column, row].append((label, is_area, shape))
     return pieces_of_tile
 
 

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from gsmap.utils.errors import InputError
 
 NUM_CAN_BUS = 18
-OF_ONE_FRAME = slice(3, 17)  # entries of ``can_bus`` that need no earlier frame
+# Entries of ``can_bus`` that need no earlier frame. The first three and the last one are the motion
+# since the previous frame.
+OF_ONE_FRAME = slice(3, 17)
 
 # Camera that is 1 km away from the vehicle along +y of the annotation frame and looks along +y. The
 # whole range of the map is behind the camera, and its frustum is out of range. So it contributes to
@@ -49,7 +51,8 @@ def calibration_arrays(
       and (u * d, v * d, d, 1), with pixels u, v of the image of the network and depth d in metres.
     * ``img_from_ground`` and its inverse ``ground_from_img``: as above, but z of the annotation
       frame is replaced by the height above the ground, the plane z = 0 of the vehicle.
-    * ``cam_from_ground`` and ``ego_from_cam``: transforms in metres, with ground as above.
+    * ``cam_from_ground`` and ``ego_from_cam``: transforms in metres. Points on the side of the
+      ground are (x, y, height above the ground), as above.
     * ``cam2img``, ``img_aug_matrix`` and ``can_bus``: fields of the metainfo. ``can_bus`` is
       processed by `without_history`, and zero if the sample lacks it.
 
@@ -57,13 +60,14 @@ def calibration_arrays(
         meta: Metainfo of the sample: ``lidar2img``, ``lidar2cam``, ``cam2img`` and
             ``img_aug_matrix`` (V, 4, 4), ``lidar2ego`` (4, 4) and ``can_bus`` (18,), as far as the
             arrays need them. In these names, ``lidar`` is the annotation frame.
-        names: Names of the arrays.
+        names: Names of the arrays, from the list above.
 
     Returns:
         Arrays by name: ``can_bus`` (18,), others (V, 4, 4).
 
     Raises:
-        ValueError: If the sample lacks a field.
+        ValueError: If the sample lacks a field other than ``can_bus``, or ``can_bus`` has a wrong
+            number of signals.
     """
 
     def field(key: str) -> NDArray[np.floating[Any]]:
@@ -81,7 +85,8 @@ def calibration_arrays(
     def img_from_ground() -> NDArray[np.float64]:
         return field("lidar2img") @ _frame_from_ground(field("lidar2ego"))
 
-    # Inverses are computed in float64, so that their float32 values are correctly rounded.
+    # Inverses are computed in float64, so that their float32 values are correctly rounded. The
+    # entries are functions, so that only the fields of the requested arrays are needed.
     derived = {
         "img_from_frame": lambda: field("lidar2img"),
         "img_from_ground": img_from_ground,

@@ -1,4 +1,9 @@
-"""Distances between lines and Bezier curves fitted to them, compiled by numba for ``bezier``."""
+"""Distances between lines and Bezier curves fitted to them.
+
+The functions are kernels: numba compiles them, because `gsmap.structures.bezier` calls them very
+often. Its search only asks whether a distance is below a limit, so they stop at a distance of
+``enough``.
+"""
 
 import math
 
@@ -6,26 +11,27 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-import gsmap.utils.compilation  # noqa: F401 - logs that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - logs a notice while kernels are compiled
 
 Float = NDArray[np.float64]
 
 
 @njit(cache=True)
 def resample_line(points: Float, num_points: int) -> Float:
-    """Resample a line at equal distances, both ends included. (n, 2) -> (P, 2)"""
-    along = np.zeros(len(points))
+    """Resample a line to P >= 2 equidistant points, both ends included. (n, 2) -> (P, 2)"""
+    along = np.zeros(len(points))  # distance of each vertex from the start along the line
     for i in range(1, len(points)):
         dx = points[i, 0] - points[i - 1, 0]
         dy = points[i, 1] - points[i - 1, 1]
         along[i] = along[i - 1] + math.sqrt(dx * dx + dy * dy)
     samples = np.empty((num_points, 2))
-    i = 0
+    i = 0  # index of the segment, which only increases with the distance
     for k in range(num_points):
         distance = along[-1] * k / (num_points - 1)
         while i < len(points) - 2 and along[i + 1] < distance:
             i += 1
         length = along[i + 1] - along[i]
+        # Position in the segment, from 0 to 1. It may exceed 1 by rounding at the end of the line.
         share = min((distance - along[i]) / length, 1.0) if length > 0.0 else 1.0
         for axis in range(2):
             samples[k, axis] = points[i, axis] + share * (points[i + 1, axis] - points[i, axis])
@@ -42,8 +48,10 @@ def largest_distance(points: Float, line: Float, enough: float) -> float:
         enough: Distance in metres at which the search ends.
 
     Returns:
-        Largest distance in metres, or a distance of at least ``enough``.
+        Largest distance in metres. If it is at least ``enough``, any distance from ``enough`` to
+        the largest one.
     """
+    # Squared distances are compared, which saves a square root per segment.
     largest_squared = 0.0
     for p in range(len(points)):
         x = points[p, 0]
@@ -81,7 +89,8 @@ def largest_deviation(line: Float, curve: Float, num_points: int, enough: float)
         enough: Distance in metres at which the search ends.
 
     Returns:
-        Larger of both distances in metres, or a distance of at least ``enough``.
+        Larger of both distances in metres. If it is at least ``enough``, any distance from
+        ``enough`` to the larger one.
     """
     largest = largest_distance(resample_line(line, num_points), curve, enough=enough)
     if largest < enough:
@@ -106,7 +115,8 @@ def deviation_of_fit(line: Float, inverse: Float, weights: Float, enough: float)
         enough: Distance in metres at which the search ends.
 
     Returns:
-        Largest distance in metres, or a distance of at least ``enough``.
+        Largest distance in metres. If it is at least ``enough``, any distance from ``enough`` to
+        the largest one.
     """
     controls = inverse @ resample_line(line, len(weights))
     controls[0] = line[0]

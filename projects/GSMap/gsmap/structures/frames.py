@@ -1,4 +1,8 @@
-"""Axes and ground planes of annotation frames, for displays."""
+"""Axes and ground planes of annotation frames, for displays.
+
+The annotation frame is the frame in which the map of a sample is given. In a display, x points to
+the right of the vehicle and y points ahead.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -14,8 +18,8 @@ class FrameView:
     Args:
         forward: Axis that points ahead: ``"y"`` (x is right) or ``"x"`` (y is left).
         ground: Ground plane z = a x + b y + c as (a, b, c), c in metres.
-        vehicle_m: Coordinates of the rear end and the front end of the ego vehicle along the
-            forward axis, and its width, in metres.
+        vehicle_m: Rear end and front end of the ego vehicle as coordinates along the forward axis,
+            and its width, all in metres.
         ego_ground_z_m: Height of the ground in the frame of the *vehicle*, in metres, from which
             ``with_mounting`` computes the ground plane.
     """
@@ -32,8 +36,8 @@ class FrameView:
         metre at a distance of 20 m.
 
         Args:
-            ego_from_frame: Transform from the frame to the vehicle, in metres; None for the usual
-                level ground of the frame. (4, 4)
+            ego_from_frame: Transform from the frame to the vehicle, in metres; None keeps the
+                ground plane of this view. (4, 4)
         """
         if ego_from_frame is None:
             return self
@@ -58,10 +62,10 @@ class FrameView:
         """Add the height of the ground plane to points without z.
 
         Args:
-            points: Points in metres. (..., 2 or 3)
+            points: Points in metres in the frame. (..., 2 or 3)
 
         Returns:
-            Points with z. (..., 3)
+            Points with z; points that already have z are not changed. (..., 3)
         """
         if points.shape[-1] >= 3:
             return points[..., :3]
@@ -81,8 +85,9 @@ def viewing_azimuth(img_from_frame: FloatArray, view: FrameView) -> float:
         Angle of the optical axis from straight ahead in radians, in (-pi, pi], positive to the
         left.
     """
+    # The direction of the axis, without its height. A direction is rotated like a point.
     right, ahead = view.display_from_frame(np.asarray(img_from_frame)[2, :2])
-    return float(np.arctan2(-right, ahead))
+    return float(np.arctan2(-right, ahead))  # the left is positive, hence the minus sign
 
 
 # "lidar" is the frame of the roof LiDAR of nuScenes, 1.84 m above the road. The vehicle frame of
@@ -111,5 +116,6 @@ def frame_view(frame: str, ground_z_m: float | None = None) -> FrameView:
     view = FRAME_VIEWS[frame]
     if ground_z_m is None:
         return view
+    # The frame ``ego`` is the frame of the vehicle, so both heights are equal.
     ego_ground_z_m = ground_z_m if frame == "ego" else view.ego_ground_z_m
     return replace(view, ground=(0.0, 0.0, ground_z_m), ego_ground_z_m=ego_ground_z_m)

@@ -83,11 +83,13 @@ class BEVGrid:
             pixel_m: Side of a pixel in metres, or its sizes along x and y.
 
         Raises:
-            ValueError: If the pixels do not divide the extent.
+            ValueError: If a size is not > 0, or the pixels do not divide the extent.
         """
         if isinstance(pixel_m, (int, float)):
             pixel_m = (pixel_m, pixel_m)
         size_x, size_y = pixel_m
+        if not (size_x > 0 and size_y > 0):  # true for NaN, too
+            raise InputError(f"pixel_m must be > 0 m, got {size_x:g} x {size_y:g} m.")
         length_x, length_y = self.extent_m
         columns = length_x / size_x
         rows = length_y / size_y

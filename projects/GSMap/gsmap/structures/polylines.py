@@ -12,11 +12,14 @@ from gsmap.utils.errors import InputError
 Points = NDArray[np.floating[Any]]
 
 PADDING = -10000.0
-"""Value of the unused rows of ``equivalent_orders`` and ``sampled_orders``."""
+"""Value of the unused rows of ``equivalent_orders`` and ``sampled_orders``.
+
+It is far from all points in metres, so an unused row is never the nearest one.
+"""
 
 
 def _check_polyline(points: Points, num_points: int = 2) -> Points:
-    """Check a polyline (n, D) and ``num_points``, and convert the polyline to float64."""
+    """Check a polyline (n, D) and the number of points to resample, and convert it to float64."""
     points = np.asarray(points)
     if points.ndim != 2 or len(points) < 2 or points.shape[1] < 2:
         raise InputError(f"points must have shape (n >= 2, 2 or 3), got {points.shape}.")
@@ -26,7 +29,10 @@ def _check_polyline(points: Points, num_points: int = 2) -> Points:
 
 
 def is_closed(points: Points) -> bool:
-    """Whether a polyline is a ring: its last point equals its first exactly. (n, D)."""
+    """Whether a polyline is a ring: its last point equals its first exactly. (n, D)
+
+    Two equal points are not a ring.
+    """
     return len(points) > 2 and bool(np.array_equal(points[0], points[-1]))
 
 
@@ -48,7 +54,9 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
 
 
 def points_at_steps(points: Points, step: float) -> NDArray[np.float64]:
-    """Sample a line at equal steps from its start; a shorter rest at its end is dropped.
+    """Sample a line at equal steps from its start.
+
+    The last sample is at most one step before the end of the line, which is not sampled itself.
 
     Args:
         points: Vertices of the line. (n, D)
@@ -70,12 +78,13 @@ def pad_lines(
     """Stack lines of different lengths and pad the shorter ones at their end.
 
     Args:
-        lines: Points of each line, at least one. K x (n, D)
-        length: Number P of points; None for the length of the longest line, or 2 without lines.
+        lines: Points of each line, at least one point per line. K x (n, D)
+        length: Number P of points, at least the length of the longest line; None for the length of
+            the longest line, or 2 without lines.
         mode: Padding: ``"edge"`` repeats the last point, ``"constant"`` is zero.
 
     Returns:
-        Lines. (K, P, D)
+        Lines. (K, P, D), or (0, P, 2) without lines
     """
     length = length or max(map(len, lines), default=2)
     rows = []
@@ -90,7 +99,8 @@ def parts_inside(
 ) -> list[NDArray[np.float64]]:
     """Compute the parts of a line inside a rectangle by shapely.
 
-    Unlike in `clip_to_box`, a line that crosses itself is also cut at the crossing.
+    Unlike in `clip_to_box`, a line that crosses itself is also cut at the crossing, because shapely
+    cuts it there.
 
     Args:
         points: Vertices in metres; a line of fewer than two has no parts. (n, 2)
@@ -100,7 +110,7 @@ def parts_inside(
     Returns:
         Parts of the line inside the rectangle, each (m >= 2, 2).
     """
-    import shapely  # imported here: result files are read without scipy and shapely
+    import shapely  # imported here, so that result files can be read without shapely
 
     if len(points) < 2:
         return []
@@ -128,14 +138,16 @@ def resample(points: Points, num_points: int) -> NDArray[np.float64]:
         ValueError: If ``points`` is no polyline or ``num_points`` is less than 2.
     """
     points = _check_polyline(points, num_points)
-    offsets = np.array([0, len(points)])
+    offsets = np.array([0, len(points)])  # of a single polyline
     return resample_all(points, offsets, num_points=num_points)[0]
 
 
 def resample_all(
     points: Points, offsets: NDArray[np.integer[Any]], num_points: int
 ) -> NDArray[np.float64]:
-    """Resample polylines at equal distances in the plane, see `resample`.
+    """Resample polylines at equal distances in the plane, both ends included.
+
+    `resample` does this for a single polyline, and checks it. Here nothing is checked.
 
     Args:
         points: Vertices of all polylines, in metres. (M, D)
@@ -149,19 +161,20 @@ def resample_all(
     resampled = np.zeros((len(counts), num_points, points.shape[1]))
     if not counts.any():
         return resampled
-    # All polylines get the length n of the longest: the last vertex is repeated.
-    place = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # in the polyline, (N, n)
-    vertex = place + offsets[:-1, None]  # row of `points`
-    # In a polyline without vertices, the place is -1, and the row is -1 or belongs to another
+    # All polylines get the length n of the longest: the last vertex is repeated. `indices` counts
+    # the vertices within a polyline, and `rows` are the corresponding rows of `points`. (N, n)
+    indices = np.minimum(np.arange(counts.max()), counts[:, None] - 1)
+    rows = indices + offsets[:-1, None]
+    # In a polyline without vertices, the index is -1, and the row is -1 or belongs to another
     # polyline. Any valid row will do, because the result of this polyline stays zero below.
-    vertices = points[vertex.clip(0)]  # (N, n, D)
+    vertices = points[rows.clip(0)]  # (N, n, D)
     steps = np.linalg.norm(np.diff(vertices[..., :2], axis=1), axis=-1)
-    along = np.zeros(vertex.shape)
+    along = np.zeros(rows.shape)  # distance of each vertex from the start of its polyline
     np.cumsum(steps, axis=1, out=along[:, 1:])
     distances = np.arange(num_points) * (along[:, -1:] / (num_points - 1))  # (N, P)
-    distances[:, -1] = along[:, -1]
+    distances[:, -1] = along[:, -1]  # exactly, in spite of rounding
     for i in np.flatnonzero(counts):
-        n = counts[i]
+        n = counts[i]  # without repeated vertices
         for axis in range(points.shape[1]):
             resampled[i, :, axis] = np.interp(distances[i], along[i, :n], vertices[i, :n, axis])
     return resampled
@@ -175,7 +188,7 @@ def equivalent_orders(
     An open polyline has two orders: forward and reversed. A ring, whose last vertex equals its
     first, has n - 1 different vertices and one order for each of them. The order starts at the
     vertex and keeps the direction of the ring. Order k starts k vertices before the first one. If
-    there are more than P - 1 vertices, P - 1 of them are selected.
+    there are more than S = max(P - 1, 2) vertices, S of them are selected.
 
     Args:
         points: Vertices at full resolution, in metres. (n, D)
@@ -183,29 +196,32 @@ def equivalent_orders(
         rng: Generator for a random selection of vertices of a ring; None for an even one.
 
     Returns:
-        Orders; unused rows are ``PADDING``. (max(P - 1, 2), P, D)
+        Orders in the first rows; unused rows are ``PADDING``. (S, P, D)
 
     Raises:
         ValueError: If ``points`` is no polyline or ``num_points`` is less than 2.
     """
     points = _check_polyline(points, num_points)
-    slots = max(num_points - 1, 2)
-    orders = np.full((slots, num_points, points.shape[1]), PADDING)
+    num_rows = max(num_points - 1, 2)  # an open polyline needs two
+    orders = np.full((num_rows, num_points, points.shape[1]), PADDING)
     if not is_closed(points):
         orders[0] = resample(points, num_points)
         orders[1] = orders[0, ::-1]
         return orders
-    count = len(points) - 1
-    if count <= slots:
+    count = len(points) - 1  # different vertices
+    # A roll is the number of vertices by which an order starts before the first vertex.
+    if count <= num_rows:
         rolls = np.arange(count)
     elif rng is None:
-        rolls = np.linspace(0, count, slots, endpoint=False).astype(np.int64)
+        rolls = np.linspace(0, count, num_rows, endpoint=False).astype(np.int64)
     else:
-        rolls = rng.choice(count, slots, replace=False)
+        rolls = rng.choice(count, num_rows, replace=False)
     twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
     along = arc_lengths(twice)
-    # Distance of the first point of each order, which is `rolls` vertices before the ring's start.
+    # Distance along the ring of the first vertex of each order. As a ring has no beginning, `rolls`
+    # vertices before vertex 0 is vertex count - rolls.
     starts = along[-rolls % count, None]
+    # The length of one lap is `along[count]`.
     distances = starts + np.linspace(0.0, along[count], num_points)
     columns = [np.interp(distances, along, column) for column in twice.T]
     orders[: len(rolls)] = np.stack(columns, axis=-1)
@@ -223,7 +239,8 @@ def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
         closed: Whether the line is closed.
 
     Returns:
-        Orders; unused rows are ``PADDING``. (2 (P - 1), P, D)
+        Orders in the first rows, of a closed line all forward orders first; unused rows are
+        ``PADDING``. (2 (P - 1), P, D)
     """
     orders = np.full((2 * (len(points) - 1), *points.shape), PADDING)
     if not closed:
@@ -234,30 +251,32 @@ def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
     for step in range(len(ring)):
         orders[step, :-1] = np.roll(ring, step, axis=0)
         orders[len(ring) + step, :-1] = np.roll(ring[::-1], step, axis=0)
-    orders[:, -1] = orders[:, 0]
+    orders[:, -1] = orders[:, 0]  # each order is closed
     return orders
 
 
 def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int64]:
     """Reorder the points of lines so that the path through them is short (2-opt, Croes 1958).
 
-    In each step, the part of a line whose reversal shortens the line most is reversed, until no
-    reversal shortens it. This straightens a line that runs back and forth. If the ends of a line
-    are closer than its mean step, so that it is nearly a ring, the ends do not change.
+    In each round, the run of points whose reversal shortens the line most is reversed. The rounds
+    end when no reversal shortens the line by more than ``least_gain_m``. This straightens a line
+    that runs back and forth. If the ends of a line are closer than its mean step, so that it is
+    nearly a ring, its first and last points keep their places.
 
     Args:
         lines: Points of each line in metres; lengths are measured in the plane. (M, P, 2 or 3)
-        least_gain_m: Smallest shortening by a reversal, in metres.
+        least_gain_m: Shortening that a reversal must exceed, in metres.
 
     Returns:
         Indices of the points of each line in their new order. (M, P)
     """
     lines = np.asarray(lines, np.float64)[..., :2]
     count, size = lines.shape[:2]
-    apart = np.linalg.norm(lines[:, :, None] - lines[:, None], axis=-1)  # (M, P, P)
+    # Distances between all pairs of points of a line, (M, P, P).
+    apart = np.linalg.norm(lines[:, :, None] - lines[:, None], axis=-1)
     steps = np.linalg.norm(np.diff(lines, axis=1), axis=-1)
     is_ring = apart[:, 0, -1] < steps.mean(1) if size > 1 else np.zeros(count, bool)
-    places = np.arange(size)
+    places = np.arange(size)  # positions in an order
     orders = np.tile(places, (count, 1))
     active = np.arange(count if size > 2 else 0)  # indices of lines that a reversal may shorten
     while len(active):
@@ -274,13 +293,15 @@ def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int
         before_i_to_j = paths[:, :-2, 1:-1]
         i_to_after_j = paths[:, 1:-1, 2:]
         gain = replaced - before_i_to_j - i_to_after_j
-        gain[is_ring[active], 0] = 0.0  # the ends stay
-        gain[is_ring[active], :, -1] = 0.0
-        gain = np.triu(gain, 1).reshape(len(active), -1)  # pairs with i < j
+        gain[is_ring[active], 0] = 0.0  # the first point of a ring stays
+        gain[is_ring[active], :, -1] = 0.0  # and so does its last point
+        # Only pairs with i < j are reversals. The gain of the others becomes 0. (m, P * P)
+        gain = np.triu(gain, 1).reshape(len(active), -1)
         best = gain.argmax(1)  # flat index i * P + j
         improves = gain[np.arange(len(active)), best] > least_gain_m
         active = active[improves]
-        first, last = np.divmod(best[improves, None], size)
+        first, last = np.divmod(best[improves, None], size)  # places i and j
+        # The place from which each place gets its point: first + last - place in the reversed run.
         inside = (places >= first) & (places <= last)
         reversal = np.where(inside, first + last - places, places)
         orders[active] = np.take_along_axis(orders[active], reversal, axis=1)
@@ -302,10 +323,10 @@ def clamp(points: Points, x_range: tuple[float, float], y_range: tuple[float, fl
         y_range: Smallest and largest y of the rectangle, in the unit of the points.
 
     Returns:
-        Points. (..., D)
+        Points, as a new array. (..., D)
     """
-    low, high = np.transpose([x_range, y_range])
-    clamped = np.array(points)
+    low, high = np.transpose([x_range, y_range])  # (x_min, y_min) and (x_max, y_max)
+    clamped = np.array(points)  # a copy
     clamped[..., :2] = np.clip(clamped[..., :2], low, high)
     return clamped
 
@@ -331,41 +352,45 @@ def clip_to_box(
         ValueError: If ``points`` is no polyline.
     """
     points = _check_polyline(points)
-    step = np.diff(points, axis=0)
+    step = np.diff(points, axis=0)  # of each segment
     has_length = step.any(axis=-1)
     start = points[:-1][has_length]
     step = step[has_length]
-    edges = np.array([x_range, y_range]).T[:, None]  # lower edges in x and y, then upper edges
+    # Lower edges in x and y, then upper edges. (2, 1, 2)
+    edges = np.array([x_range, y_range]).T[:, None]
     # Share of each segment at which it crosses the lines of the lower and the upper edges in x and
     # y, infinite if it is parallel to an edge.
     with np.errstate(divide="ignore", invalid="ignore"):
         cuts = (edges - start[:, :2]) / step[:, :2]  # (2, n, 2)
-    # A segment on the line of an edge gives 0 / 0. Such an edge does not cut it.
+    # A segment on the line of an edge gives 0 / 0. Such an edge does not cut it, so the segment
+    # counts as entering at minus infinity and leaving at infinity.
     along_edge = (step[:, :2] == 0) & np.isnan(cuts)
     cuts = np.where(along_edge, [[[-np.inf]], [[np.inf]]], cuts)
-    # Shares in [0, 1] of a segment at which it enters and leaves the rectangle. A segment that
-    # misses the rectangle has enter >= leave.
+    # Shares in [0, 1] of a segment at which it enters and leaves the rectangle: it enters where it
+    # has entered both ranges, of x and of y, and leaves where it leaves the first one. A segment
+    # that misses the rectangle has enter >= leave.
     enter = cuts.min(0).max(-1).clip(min=0)
     leave = cuts.max(0).min(-1).clip(max=1)
     hits = np.flatnonzero(enter < leave)
     if not len(hits):
         return []
+    # First and last point inside the rectangle of each segment that hits it.
     first = start[hits] + enter[hits, None] * step[hits]
     last = start[hits] + leave[hits, None] * step[hits]
     # A piece continues if the next segment hits, and the vertex between both is inside.
     is_next = np.diff(hits) == 1
     is_joined = is_next & (leave[hits[:-1]] == 1.0) & (enter[hits[1:]] == 0.0)
     breaks = np.flatnonzero(~is_joined) + 1
-    ends = [0, *breaks.tolist(), len(hits)]
+    limits = [0, *breaks.tolist(), len(hits)]
     pieces = []
-    for a, b in pairwise(ends):
+    for begin, end in pairwise(limits):
         # The start of the first segment of the piece, and the ends of all of its segments.
-        piece = np.concatenate([first[a : a + 1], last[a:b]])
+        piece = np.concatenate([first[begin : begin + 1], last[begin:end]])
         pieces.append(piece)
     starts_inside = hits[0] == 0 and enter[0] == 0
     ends_inside = hits[-1] == len(start) - 1 and leave[-1] == 1
     # The last piece of a ring goes on with the first one, if both meet inside the rectangle.
     if len(pieces) > 1 and starts_inside and ends_inside and is_closed(points):
         last_piece = pieces.pop()
-        pieces[0] = np.concatenate([last_piece, pieces[0][1:]])
+        pieces[0] = np.concatenate([last_piece, pieces[0][1:]])  # the common vertex once
     return pieces

@@ -1,7 +1,12 @@
 """Streams of frames, their memory, and rules for the order of frames.
 
 A stream is a sequence of frames of one drive. Its memory is the tensors that a temporal model
-computes in a frame and reads in the next one.
+computes in a frame and reads in the next one. `Slots` and `Scenes` hold the memory of several
+streams. Before each batch, the model reads the memory by ``previous``. After the batch, it stores
+the new memory by ``keep``.
+
+A frame is one sample of a drive. The word is also used for coordinate systems, as in "annotation
+frame", the coordinate system of the map elements of a sample.
 """
 
 from collections import OrderedDict
@@ -22,12 +27,12 @@ class Frame:
 
     Args:
         token: Name of the sample.
-        scene: Name of the scene.
+        scene: Name of the scene, which is a drive or a part of it.
         timestamp_ns: Time in nanoseconds.
         pose: Transform from the annotation frame to the world in metres. (4, 4)
 
     Raises:
-        ValueError: If the pose is no rigid motion.
+        ValueError: If the pose is no finite rigid motion (4, 4).
     """
 
     token: str
@@ -49,7 +54,8 @@ class Frame:
         """Create a frame from the metainfo of a sample.
 
         Args:
-            meta: Metainfo with ``scene``, ``timestamp_ns``, ``lidar2global`` and ``token``.
+            meta: Metainfo with ``scene``, ``timestamp_ns``, ``token``, and the pose as
+                ``lidar2global``. Only the token may be missing.
 
         Raises:
             ValueError: If a field is missing or the pose is no rigid motion.
@@ -72,11 +78,11 @@ class Frame:
         return f"{self.token!r} (scene {self.scene!r}, {self.timestamp_ns / 1e9:.3f} s)"
 
     def seconds_after(self, earlier: "Frame") -> float:
-        """Time since another frame in seconds."""
+        """Time since another frame in seconds; negative if that frame is later."""
         return (self.timestamp_ns - earlier.timestamp_ns) / 1e9
 
     def motion_from(self, earlier: "Frame") -> NDArray[np.float64]:
-        """Transform from another frame to this one in metres. (4, 4)"""
+        """Transform in metres from the annotation frame of another sample to this one's. (4, 4)"""
         return invert_rigid(self.pose) @ earlier.pose
 
 
@@ -97,7 +103,8 @@ class Slots:
     """Streams by their index in the batch, for training.
 
     A sampler supplies each index with consecutive samples. A sample that does not follow the
-    previous one (another scene, an earlier time, a gap) starts a new stream.
+    previous one (another scene, an equal or earlier time, a gap) starts a new stream. Unlike in
+    `Scenes`, this is no error, because training jumps between scenes.
 
     Args:
         max_gap_s: Longest time between two samples of a stream in seconds.
@@ -125,26 +132,32 @@ class Slots:
         return states
 
     def _follows(self, frame: Frame, state: StreamState) -> bool:
-        """Whether a frame continues a stream."""
+        """Whether a frame continues the stream of a state."""
         if frame.scene != state.frame.scene:
             return False
         return 0 < frame.seconds_after(state.frame) <= self.max_gap_s
 
     def keep(self, states: Sequence[StreamState]) -> None:
-        """Store the states after the frames of a batch."""
+        """Store the states after the frames of a batch, in the order of the batch."""
         self.states = list(states)
 
 
 class Scenes:
     """Streams by the name of their scene, for testing. Frames of a scene must come in order.
 
-    The streams are bound to one model (`claim`). A copy, for example by pickle, can be continued by
-    any model of equal name (``str(model)``).
+    The streams are bound to one model (`claim`), since another model cannot read its memory. A
+    copy, for example by pickle, does not contain the model. It can be continued by any model of
+    equal name (``str(model)``).
 
     Args:
         max_gap_s: Longest time between two frames of a stream in seconds.
         max_streams: Largest number of streams. Beyond it, the stream that has received no frame for
             the longest time is dropped.
+
+    Attributes:
+        states: State of each stream by the name of its scene, the stream with the latest frame
+            last.
+        owner: Model that the streams are bound to, the name of the model in a copy, or None.
     """
 
     def __init__(self, max_gap_s: float, max_streams: int = 16) -> None:
@@ -160,9 +173,11 @@ class Scenes:
             owner: Model.
 
         Raises:
-            ValueError: If the streams are bound to another model.
+            ValueError: If the streams are bound to another model, or are a copy for a model of
+                another name.
         """
-        # In a copy, `self.owner` is the name of the model (`__getstate__`).
+        # In a copy, `self.owner` is the name of the model (`__getstate__`). The first model of this
+        # name becomes the owner.
         if self.owner is None or self.owner == str(owner):
             self.owner = owner
         if self.owner is not owner:
@@ -185,7 +200,8 @@ class Scenes:
             frames: Frames of a batch.
 
         Returns:
-            State of the stream of each frame; None for a frame that starts a stream.
+            State of the stream of each frame; None for a frame that starts a stream, which is the
+            first one of its scene or follows a gap.
 
         Raises:
             ValueError: If two frames are of one scene, or a frame is not later than the previous
@@ -222,14 +238,14 @@ class Scenes:
         """Store the states after the frames of a batch."""
         for state in states:
             self.states[state.frame.scene] = state
-            self.states.move_to_end(state.frame.scene)
+            self.states.move_to_end(state.frame.scene)  # so the oldest stream is at the beginning
         # Streams of this batch are never dropped, even if the batch is larger than the limit.
         while len(self.states) > max(self.max_streams, len(states)):
             self.states.popitem(last=False)
 
 
 class MapStream(Scenes):
-    """Stream of a single scene for `MapInferencer`.
+    """Stream of a single scene for `MapInferencer`, which predicts maps frame by frame.
 
     Args:
         max_gap_s: Longest time between two frames of the stream in seconds.
@@ -254,11 +270,12 @@ class MapStream(Scenes):
             State of the stream of each frame; None for a frame that starts the stream.
 
         Raises:
-            ValueError: If a frame is of another scene, or is not later than the previous frame.
+            ValueError: If a frame is of another scene, or is not later than the previous frame, or
+                there is more than one frame.
         """
         last = self.last
         for frame in frames:
-            if last is None:
+            if last is None:  # the first frame determines the scene
                 last = frame
             if frame.scene != last.scene:
                 raise InputError(

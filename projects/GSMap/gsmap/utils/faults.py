@@ -8,6 +8,7 @@ from typing import Any
 
 from gsmap.utils.errors import GsmapError
 
+# The constants below are parts of messages to the user.
 _FREE_SPACE = "free some space there, or write elsewhere"
 _REDUCE_MEMORY = (
     "take a smaller batch (train_dataloader.batch_size=1), fewer processes (num_workers, "
@@ -18,6 +19,7 @@ _BUS_ERROR_ADVICE = (
     "file again), or /dev/shm is full (take fewer num_workers)"
 )
 _FEWER_PROCESSES = "use fewer processes (num_workers, --workers)"
+# Remedy for each code of a system error.
 _REMEDIES = {
     errno.ENOSPC: _FREE_SPACE,
     errno.EDQUOT: _FREE_SPACE,
@@ -33,6 +35,8 @@ _REMEDIES = {
     errno.ENFILE: _FEWER_PROCESSES,
     errno.ENOMEM: _FEWER_PROCESSES,
 }
+# Patterns that recognise the messages of torch and other libraries. The libraries raise general
+# classes such as ``RuntimeError`` for these faults.
 _NO_MEMORY = re.compile(
     r"out of memory|(can't|Cannot|cannot) allocate memory|not enough memory|DataLoader worker \(pid"
 )
@@ -40,8 +44,10 @@ _NO_HANDLES = re.compile("Too many open files. Communication with the workers") 
 _NO_DEVICE = re.compile(
     "not compiled with CUDA|no NVIDIA driver|No CUDA GPUs|invalid device ordinal|device string"
 )
+# A rank is a process of distributed training. It raises such an error after another one has died.
 _NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", flags=re.DOTALL)
-_IN_WORKER = "Original Traceback (most recent call last)"  # in errors of a DataLoader's worker
+# Part of the message of an error that was raised in a worker process of a DataLoader.
+_IN_WORKER = "Original Traceback (most recent call last)"
 
 
 def user_message(error: BaseException) -> str | None:
@@ -59,8 +65,10 @@ def user_message(error: BaseException) -> str | None:
     """
     text = str(error)
     if _IN_WORKER in text:  # torch re-raises the class with a traceback as its message
+        # The last line of a traceback is "class: message".
         last_line = text.rstrip().splitlines()[-1]
         _, _, text = last_line.partition(": ")
+    # The more specific description comes first: a lack of memory may also be a system error.
     message = _describe_machine_error(error=error, text=text)
     if message is None:
         message = _describe_system_error(error=error, text=text)
@@ -72,13 +80,15 @@ def user_message(error: BaseException) -> str | None:
 def is_machine_error(error: BaseException) -> bool:
     """Whether an error comes from the machine, not from the content of a file.
 
-    Examples are a lack of memory, a missing file and missing permissions.
+    Examples are a lack of memory, a missing file and missing permissions. Code that reports damaged
+    files uses this function to leave such errors unchanged.
     """
     if isinstance(error, MemoryError):  # also raised by Arrow
         return True
     if isinstance(error, OSError) and error.errno:
-        # Damaged files cause EINVAL, since it is raised for negative positions in a file.
+        # EINVAL is raised for a negative position in a file, which a damaged file can cause.
         return error.errno != errno.EINVAL
+    # An error without a code of the system, such as an error of a library.
     return isinstance(error, RuntimeError | OSError) and bool(_NO_MEMORY.search(str(error)))
 
 
@@ -94,7 +104,10 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 
 
 def registry_names(registry: Any) -> list[str]:
-    """Return the names in a registry of mmengine, its root and all registries below the root."""
+    """Return the names in a registry of mmengine, its root and all registries below the root.
+
+    mmengine searches all of them for the class of a part, so each name is a possible suggestion.
+    """
     root = registry
     while root.parent is not None:
         root = root.parent
@@ -108,9 +121,17 @@ def registry_names(registry: Any) -> list[str]:
 
 
 def _describe_machine_error(error: BaseException, text: str) -> str | None:
-    """Describe a lack of memory, a missing device or a dead process."""
+    """Describe a lack of memory or of file handles, a missing device or a dead process.
+
+    Args:
+        error: Exception.
+        text: Message of the exception, without the traceback of a worker.
+
+    Returns:
+        The description with a remedy, or None for other errors.
+    """
     is_runtime_error = isinstance(error, RuntimeError)
-    reason = type(error).__name__
+    reason = type(error).__name__  # for an error without a message
     if text.strip():
         first_line = text.strip().splitlines()[0]
         reason = first_line.rstrip(".")
@@ -138,10 +159,16 @@ def _describe_machine_error(error: BaseException, text: str) -> str | None:
 
 
 def _describe_system_error(error: BaseException, text: str) -> str | None:
-    """Describe an error of the operating system, with a remedy if there is one for its code."""
+    """Describe an error of the operating system, with a remedy if there is one for its code.
+
+    Messages with another beginning than ``[Errno`` are texts of this package, which have a remedy.
+
+    Returns:
+        The description, or None for other errors.
+    """
     if not isinstance(error, OSError):
         return None
-    remedy = _REMEDIES.get(error.errno or 0)
+    remedy = _REMEDIES.get(error.errno or 0)  # 0, which is no code, for an error without a code
     if remedy and text.startswith("[Errno"):
         return f"{text}; {remedy}."
     return text

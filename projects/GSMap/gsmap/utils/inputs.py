@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from gsmap.utils.errors import InputError, WorkError
 
 _Identity = tuple[int, int, int]  # device, inode and modification time of a file
-_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT  # a file opened with one of these flags is written
 _SYSTEM_FOLDERS = ("/dev/", "/proc/", "/sys/")  # pipes and devices there may be read
 _MARKED_BYTES = 1 << 16  # number of bytes that `has_mark` searches at each end of a file
 
@@ -21,12 +21,12 @@ class InputReplacedError(WorkError):
 
 
 class _Command:
-    """Input and output files of the running command."""
+    """Input and output files of the running command, as class attributes without any object."""
 
     is_running = False
     inputs: ClassVar[dict[_Identity, Path]] = {}  # files that arguments name
     outputs: ClassVar[dict[_Identity, str]] = {}  # option and path of existing output files
-    has_hook = False
+    has_hook = False  # Python cannot remove an audit hook, so it is added once per process
 
 
 def watch_files() -> None:
@@ -65,15 +65,15 @@ def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -
         outputs: Files that the command writes, each with the option that names it.
 
     Raises:
-        InputReplacedError: If a file is both an input and an output.
+        InputReplacedError: If an existing file is both an input and an output.
         ValueError: If two options name one output.
     """
-    places: dict[str, str] = {}
+    option_of_path: dict[str, str] = {}
     for path, option in outputs:
         if path.is_file() or not path.exists():  # a device may receive several outputs
-            first = places.setdefault(os.path.realpath(path), option)
-            if first != option:
-                raise InputError(f"{first} and {option} both name {path}: give two names.")
+            first_option = option_of_path.setdefault(os.path.realpath(path), option)
+            if first_option != option:
+                raise InputError(f"{first_option} and {option} both name {path}: give two names.")
     existing_outputs: dict[_Identity, str] = {}
     for path, option in outputs:
         identity = _identity(path)
@@ -81,6 +81,7 @@ def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -
             existing_outputs[identity] = f"{option} {path}"
     for path in inputs:
         _refuse_output(path=path, outputs=existing_outputs)
+    # Outside of `protect_inputs` the files are checked, but later accesses are not watched.
     if not _Command.is_running:
         return
     for path in inputs:
@@ -119,7 +120,7 @@ def check_input(path: str | bytes | os.PathLike) -> None:
 
 
 def _refuse_output(path: str | bytes | os.PathLike, outputs: Mapping[_Identity, str]) -> None:
-    """Raise an error if a file to read is one of the outputs."""
+    """Raise an error if a file to read is one of the outputs (option and path of each)."""
     identity = _identity(path) if outputs else None
     if identity is not None and identity in outputs:
         raise InputReplacedError(
@@ -185,7 +186,10 @@ def require_own_file(path: Path, mark: bytes) -> None:
 
 
 def forget_output(path: Path) -> None:
-    """Allow the reading of a file that was declared as an output and is about to be replaced."""
+    """Allow the reading of a file that was declared as an output and is about to be replaced.
+
+    The writers of `gsmap.utils.files` call this.
+    """
     if not _Command.outputs:
         return
     identity = _identity(path)
@@ -200,16 +204,18 @@ def _on_event(event: str, arguments: tuple[Any, ...]) -> None:
     if event == "open":
         path, _, flags = arguments
         if isinstance(path, str | bytes):
-            is_written = (flags or 0) & _WRITING
+            # `flags` may be None, and reading is the absence of all flags of `_WRITING`.
+            is_written = ((flags or 0) & _WRITING) != 0
             if not is_written:
                 check_input(path)
     elif event == "sqlite3.connect" and isinstance(arguments[0], str):
+        # The argument may be a URI such as "file:drive.db3?mode=ro".
         path, _, _ = arguments[0].removeprefix("file:").partition("?")
         check_input(path)
 
 
 def _identity(path: str | bytes | os.PathLike) -> _Identity | None:
-    """Return a value that identifies a file under all of its names; None if it is not a file."""
+    """Return a value that identifies a file under all of its names; None if it is no plain file."""
     try:
         status = os.stat(path)
     except (OSError, ValueError):  # ValueError for a name with a zero byte

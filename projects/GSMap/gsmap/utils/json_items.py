@@ -1,4 +1,7 @@
-"""Incremental reading of a long list in a JSON file, item by item."""
+"""Incremental reading of a long list in a JSON file, item by item.
+
+The file is read in blocks. Only the text that is not consumed yet and one item are in memory.
+"""
 
 import json
 import re
@@ -11,9 +14,10 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import fetch_advice
 
 Place = tuple[int, int]
-"""Offset and length of an item in its file, in bytes."""
+"""Offset and length of an item in its file, in bytes, by which it can be read again."""
 _BLOCK = 1 << 20  # bytes
 _LISTED_NAMES = 5  # largest number of names in a message
+# Kind of a value, by its first character, for messages.
 _KINDS = {"{": "an object", "[": "a list", '"': "a text"}
 _SPACE = re.compile(r"[ \t\n\r]*")
 _DECODER = json.JSONDecoder()
@@ -29,11 +33,13 @@ def items_of(
         key: Key of the list in the file's object; None if the file itself is a list.
         advice: Remedy for a file without the list, for the message.
         other_entries: Dictionary whose keys name further entries of the object; their values are
-            filled in as the file is read.
+            filled in as the file is read, and are complete after the last item. Ignored if the
+            file itself is a list.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file is not valid JSON or lacks the list, possibly after some items.
+        ValueError: If the file is not valid JSON or lacks the list. As items are yielded before the
+            rest of the file is read, the error may come after some items.
     """
     with path.open("rb") as file:
         under = "" if key is None else f" under {key!r}"
@@ -42,7 +48,8 @@ def items_of(
         except _FormError as error:
             raise InputError(f"{path} holds {error} and no list{under}: {advice}.") from error
         except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
-            # Other advice for a pointer of Git LFS or a web page in place of the JSON file.
+            # The first bytes show whether a pointer of Git LFS or a web page is in place of the
+            # JSON file, for which the advice differs.
             file.seek(0)
             advice = fetch_advice(start=file.read(100), otherwise=advice)
             raise InputError(
@@ -55,14 +62,23 @@ class _FormError(ValueError):
 
 
 class _Parser:
-    """Incremental JSON parser that reads a file in blocks and consumes value by value."""
+    """Incremental JSON parser that reads a file in blocks and consumes value by value.
+
+    The text in memory is a part of the file. The position moves through the text, and the offset
+    moves through the file in step with it.
+
+    Args:
+        file: JSON file, opened in binary mode.
+    """
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
+        # An incremental decoder, since a block may end within a character.
         self._decode = getincrementaldecoder("utf-8")().decode
         self._text = ""
-        self._position = 0  # start of the next value in the text
-        self._offset = 0  # start of the next value in the file
+        self._position = 0  # start of the next value in the text, in characters
+        self._offset = 0  # start of the next value in the file, in bytes
+        # A byte order mark at the start of the file is skipped.
         if file.read(len(BOM_UTF8)) == BOM_UTF8:
             self._offset = len(BOM_UTF8)
         file.seek(self._offset)
@@ -75,13 +91,13 @@ class _Parser:
         else:
             self._require(opening="{", where="")
             yield from self._items_under(key=key, other_entries=other_entries)
-        if self._next_character():
+        if self._next_character():  # the file must end after the list or object
             raise self._error("more text")
 
     def _items_under(self, key: str, other_entries: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
         """Yield the items of the list under a key of an object."""
         has_list = False  # whether the key has been found
-        names = []
+        names = []  # other keys, for the message; each is cut to 30 characters
         for _ in self._members(opening="{", closing="}"):
             if self._next_character() != '"':
                 raise self._error("no name")
@@ -102,21 +118,30 @@ class _Parser:
             raise _FormError(f"an object with {names[:_LISTED_NAMES] or 'nothing'}")
 
     def _list_items(self) -> Iterator[tuple[Any, Place]]:
+        """Consume a list, and yield the value and the place of each item."""
         for _ in self._members(opening="[", closing="]"):
             yield self._read_value()
 
     def _require(self, opening: str, where: str) -> None:
         """Require that the next value begins with a character.
 
-        An object, a list or a text in its place raises an error that names the kind of the value.
-        Other values raise an error later, when the caller consumes ``opening``.
+        The character is not consumed. An object, a list or a text in its place raises an error that
+        names the kind of the value. Other values raise an error later, when the caller consumes
+        ``opening``.
+
+        Args:
+            opening: Required character, ``[`` or ``{``.
+            where: Place of the value, with which the message ends.
         """
         character = self._next_character()
         if character != opening and character in _KINDS:
             raise _FormError(_KINDS[character] + where)
 
     def _members(self, opening: str, closing: str) -> Iterator[None]:
-        """Consume an object or a list; at each yield, the caller consumes one member."""
+        """Consume the brackets and commas of an object or a list.
+
+        At each yield, the caller consumes one member: an item, or a key with its value.
+        """
         self._consume(opening)
         has_more = self._next_character() != closing
         while has_more:
@@ -128,15 +153,17 @@ class _Parser:
 
     def _read_value(self) -> tuple[Any, Place]:
         """Consume a value, and return it with its place."""
-        self._next_character()
+        self._next_character()  # skips white space before the value
         while True:
             try:
                 value, end = _DECODER.raw_decode(self._text, idx=self._position)
             except json.JSONDecodeError as error:
+                # The value may be cut at the end of the text. Parse it again with one more block.
                 if not self._read_block():
                     raise self._error(error.msg) from error
                 continue
-            # a number at the end of the text may continue in the next block
+            # A number at the end of the text may continue in the next block. If there is one, the
+            # value is parsed again.
             if end < len(self._text) or not self._read_block():
                 start = self._offset
                 self._advance(end)
@@ -159,7 +186,7 @@ class _Parser:
         self._advance(self._position + 1)
 
     def _advance(self, end: int) -> None:
-        """Move to a position in the text."""
+        """Move to a position in the text, and move the offset by the bytes between."""
         self._offset += len(self._text[self._position : end].encode())
         self._position = end
 
@@ -167,13 +194,14 @@ class _Parser:
         """Append a block of the file to the unread text; False at the end of the file.
 
         The block is at least as long as the unread text. So a value of many blocks is parsed again
-        only a few times, and the total time is linear in its length.
+        only a few times, and the total time is linear in its length. Consumed text is dropped.
         """
-        rest = self._text[self._position :]
-        block = self._file.read(max(_BLOCK, len(rest)))
-        self._text = rest + self._decode(block, final=not block)
+        unread = self._text[self._position :]
+        block = self._file.read(max(_BLOCK, len(unread)))
+        self._text = unread + self._decode(block, final=not block)
         self._position = 0
         return bool(block)
 
     def _error(self, fault: str) -> ValueError:
+        """Error about the next value, with its offset in the file."""
         return InputError(f"{fault} at byte {self._offset}")

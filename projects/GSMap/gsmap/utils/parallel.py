@@ -24,7 +24,9 @@ from gsmap.utils.terminal import escape_output
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-LAUNCHER = "GSMAP_LAUNCHER"  # environment variable with the process ID of torchrun, for its ranks
+# Environment variable with the process ID of torchrun, for the processes that it starts, its ranks.
+LAUNCHER = "GSMAP_LAUNCHER"
+# Function of Python that returns the interpreter options of new processes. It is replaced below.
 _interpreter_flags = util._args_from_interpreter_flags  # type: ignore[attr-defined]
 
 
@@ -40,8 +42,10 @@ def _safe_interpreter_flags() -> list[str]:
     """Return interpreter options that exclude the working folder from the module search path.
 
     Worker processes start with ``-c``, which puts the working folder first on the search path until
-    they receive the search path of their parent.
+    they receive the search path of their parent. A file there, such as ``random.py``, could replace
+    a module of Python.
     """
+    # Python 3.10 has no -P. There, -I also ignores the environment variables of Python.
     safe_flag = "-P" if sys.version_info >= (3, 11) else "-I"
     flags = _interpreter_flags()
     return flags if safe_flag in flags else [*flags, safe_flag]
@@ -67,13 +71,16 @@ def die_with_parent(parent: int) -> None:
     if _PRCTL is None:
         return
     _PRCTL(1, signal.SIGKILL)  # 1 is PR_SET_PDEATHSIG
-    if os.getppid() != parent:  # the parent has died before the call
+    if os.getppid() != parent:  # the parent has died before the call, so no signal will come
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 def kill_forks_with_parent() -> None:
-    """Let all forked child processes, and their children, die with their parent."""
-    parent = 0
+    """Let all processes that this process or its children fork die with their parent.
+
+    Examples are the workers of torch's DataLoader.
+    """
+    parent = 0  # process ID of the process that forks
 
     def record_parent() -> None:
         nonlocal parent
@@ -86,7 +93,13 @@ def kill_forks_with_parent() -> None:
 
 
 class _Worker:
-    """State of a worker process."""
+    """State of a worker process, in class attributes, since there is one state per process.
+
+    Attributes:
+        function: Function of `ordered_map`.
+        must_stop: Whether SIGTERM has been received.
+        is_working: Whether a task is in progress.
+    """
 
     function: Callable[[Any], Any]
     must_stop = False
@@ -94,11 +107,16 @@ class _Worker:
 
 
 def _start_worker(setup: Path) -> None:
-    """Prepare a worker process, which ends with its parent; read its function from ``setup``."""
+    """Prepare a worker process, which ends with its parent; read its function from ``setup``.
+
+    Args:
+        setup: File with the pickled function.
+    """
     escape_output()  # prints no control characters
     watch_files()  # raises an error if a pipe or an output of the command is read
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
     signal.signal(signal.SIGTERM, _stop_worker)
+    # The worker was started with both signals blocked (`delay_signals`). Its handlers are set now.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _Worker.function = pickle.loads(setup.read_bytes())
@@ -109,11 +127,17 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        os._exit(1)
+        os._exit(1)  # ends all threads at once; `sys.exit` would end this thread only
 
 
 def _stop_worker(number: int, _frame: object) -> None:
-    """Interrupt the current task by an exception, so that it cleans up, and start no other task."""
+    """Interrupt the current task by an exception, so that it cleans up, and start no other task.
+
+    This is the handler of SIGTERM.
+
+    Args:
+        number: Number of the signal. The exit code is 128 plus this number, as in shells.
+    """
     _Worker.must_stop = True
     if _Worker.is_working:  # between tasks, a result is being sent and must be complete
         raise SystemExit(128 + number)
@@ -138,19 +162,21 @@ def ordered_map(
 ) -> Iterator[Result]:
     """Apply a function to tasks in worker processes, and yield the results in order.
 
-    At most three tasks per worker are in progress, so neither tasks nor results accumulate. With
-    one worker, the function runs in this process. If an error or Ctrl-C occurs or the generator is
-    closed, the tasks in progress are interrupted and clean up.
+    At most three tasks per worker are in progress or wait for their turn, so neither tasks nor
+    results accumulate. With one worker, the function runs in this process, without a time limit. If
+    an error or Ctrl-C occurs or the generator is closed, the tasks in progress are interrupted and
+    clean up.
 
     Args:
-        function: Picklable function; it is sent to each worker once.
+        function: Picklable function; each worker reads it once. Its exceptions are raised here.
         tasks: Picklable arguments of the function, consumed on demand.
         workers: Number of processes, >= 1.
-        timeout_s: Time limit for one result, in seconds; None for no limit.
+        timeout_s: Longest time to wait for the next result, in seconds; None for no limit.
 
     Raises:
         ValueError: If ``workers`` is below 1.
-        RuntimeError: If a worker dies or a result exceeds the time limit; all workers are stopped.
+        RuntimeError: If a worker dies or a result exceeds the time limit (`WorkError`); all workers
+            are stopped.
     """
     if workers < 1:
         raise InputError(f"workers must be >= 1, got {workers}.")
@@ -169,12 +195,13 @@ def ordered_map(
         try:
             yield from _in_order(pool, tasks=tasks, limit=3 * workers, timeout_s=timeout_s)
         except BaseException as error:  # including GeneratorExit
-            # Python 3.14 has a public `terminate_workers`; older versions only have this attribute
+            # Python 3.14 has a public `terminate_workers`; older versions only have this attribute.
+            # It is None after the end of the pool.
             for process in list((pool._processes or {}).values()):
                 if isinstance(error, TimeoutError):
-                    process.kill()
+                    process.kill()  # a task that hangs may not react to SIGTERM
                 else:
-                    process.terminate()
+                    process.terminate()  # SIGTERM: the task cleans up (`_stop_worker`)
             if isinstance(error, BrokenProcessPool):
                 raise WorkError(
                     "a worker process died: most likely for want of memory (run again with fewer "
@@ -195,22 +222,26 @@ def ordered_map(
 def delay_signals() -> Iterator[None]:
     """Context that delays SIGINT and SIGTERM to its end.
 
+    It is used around calls that start worker processes or hold locks.
+
     Otherwise a signal would reach a worker process that is starting, which would print a traceback.
     The signal mask applies to this thread and to new processes. Another thread may receive the
     signal, and Python would run the handler in the main thread at once, so handlers are delayed as
     well.
     """
-    delayed: list[int] = []
-    handlers = {}
+    delayed: list[int] = []  # numbers of the signals that arrived in the context
+    handlers = {}  # the replaced handlers, by the number of their signal
 
     def delay(number: int, _frame: object) -> None:
         delayed.append(number)
 
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
+        # Python allows only the main thread to set handlers.
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 handler = signal.getsignal(number)
+                # None is a handler that was not set from Python. Ignored signals stay ignored.
                 if handler not in (None, signal.SIG_IGN):
                     handlers[number] = handler
                     signal.signal(number, delay)
@@ -234,10 +265,11 @@ def result_of(future: "Future[Result]", timeout_s: float | None = None) -> Resul
         timeout_s: Time limit in seconds; None for no limit.
 
     Raises:
-        TimeoutError: If there is no result within the time limit.
+        TimeoutError: If there is no result within the time limit. An exception of the task is
+            raised as well.
     """
     done: SimpleQueue[Future[Result]] = SimpleQueue()  # waits in C without a Python lock
-    with delay_signals():
+    with delay_signals():  # `add_done_callback` holds the lock of the future, too
         future.add_done_callback(done.put)
     try:
         done.get(timeout=timeout_s)
@@ -250,10 +282,10 @@ def result_of(future: "Future[Result]", timeout_s: float | None = None) -> Resul
 def _in_order(
     pool: ProcessPoolExecutor, tasks: Iterable[Any], limit: int, timeout_s: float | None
 ) -> Iterator[Any]:
-    """Keep at most ``limit`` tasks in the pool, and yield their results in order."""
+    """Keep at most ``limit`` tasks in the pool, and yield the results in the order of the tasks."""
     pending: deque[Future[Any]] = deque()
     for task in tasks:
-        with delay_signals():
+        with delay_signals():  # `submit` may start a worker process
             pending.append(pool.submit(_work, task))
         if len(pending) == limit:
             yield result_of(pending.popleft(), timeout_s=timeout_s)

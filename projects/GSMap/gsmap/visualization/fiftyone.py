@@ -22,9 +22,10 @@ from gsmap.utils.files import atomic_write
 from gsmap.utils.words import format_count
 from gsmap.visualization.camera_projection import project_segments, subdivide
 
-_STEP_M = 2.0  # largest length of a projected segment
+_STEP_M = 2.0  # largest length of a projected segment, in metres
 _DECIMALS = 6  # of positions in an image, as shares of its width and height
 _ID_DIGITS = 24  # hexadecimal digits of an ID of FiftyOne
+# Names of Python classes of FiftyOne, which the JSON file contains as the types of fields.
 _FIELDS = "fiftyone.core.fields."
 _POLYLINES = f"{_FIELDS}EmbeddedDocumentField(fiftyone.core.labels.Polylines)"
 
@@ -37,8 +38,9 @@ def write_fiftyone(
 ) -> int:
     """Write a JSON file that ``fiftyone.Dataset.from_json`` loads as a grouped data set.
 
-    Each sample is a FiftyOne group, whose slices are the images of the cameras. Map elements are
-    polylines in the images, in the fields ``ground_truth`` and ``predictions`` (with scores).
+    Each sample of this project becomes a FiftyOne group, whose slices are the images of the
+    cameras. An image is a sample of FiftyOne. Map elements are polylines in the images, in the
+    fields ``ground_truth`` and ``predictions`` (with scores).
 
     Args:
         path: File to write.
@@ -50,18 +52,21 @@ def write_fiftyone(
         Number of images.
 
     Raises:
-        ValueError: If a file is malformed, or no sample has a camera.
+        ValueError: If a file is malformed, the result file has no sample of the annotation file, or
+            no sample has a camera.
     """
     file = AnnotationFile(annotations)
     root = Path(data_root or Path(annotations).parent).resolve()
     predictions = None
-    # Place of each sample in the result file, by token. Elements are loaded sample by sample below.
+    # Place (offset and length in bytes) of each sample in the result file, by token. Elements are
+    # loaded sample by sample below, so that a large file does not fill the memory.
     places = {}
     if results is not None:
         predictions = SampleFile(results, key="results", classes=file.meta.classes)
-        places = {token: place for token, _, place in predictions}
+        places = {token: place for token, _, place in predictions}  # the elements are not kept
         if not places.keys() & set(file.column("token")):
             raise InputError(f"{results} has no sample of {annotations}.")
+    # Orientation of the annotation frame, and the ground, on which lines without z are drawn.
     view = frame_view(file.meta.frame, file.meta.ground_z_m)
     samples: list[dict[str, Any]] = []
     for sample in file:
@@ -78,7 +83,12 @@ def write_fiftyone(
 
 
 def _schema(file: AnnotationFile, samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Name, slices and types of the fields of the data set."""
+    """Name, slices and types of the fields of the data set.
+
+    Args:
+        file: Annotation file.
+        samples: Images of all samples (`_images`), at least one.
+    """
     slices = {image["group"]["name"]: "image" for image in samples}
     fields = {
         "id": f"{_FIELDS}ObjectIdField",
@@ -117,6 +127,7 @@ def _images(
         classes: Names of the classes.
         root: Data root of the images.
     """
+    # The ID of the group follows from the token, so it is equal in each export.
     group = hashlib.sha256(sample.token.encode()).hexdigest()[:_ID_DIGITS]
     for camera in sample.cameras:
         image: dict[str, Any] = {
@@ -135,9 +146,13 @@ def _images(
 def _polylines(
     elements: MapElements, camera: CameraRecord, view: FrameView, classes: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the elements inside the image of a camera, without elements of unknown classes."""
+    """Yield the elements inside the image of a camera as labels of FiftyOne.
+
+    Elements of unknown classes, which have the label -1, are left out.
+    """
     for number, line in enumerate(elements.polylines):
         label = int(elements.labels[number])
+        # `lift` puts a line without z on the ground. `shapes` are the visible parts of the line.
         shapes = _visible_parts(view.lift(line), camera)
         if label < 0 or not shapes:
             continue
@@ -167,6 +182,7 @@ def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[flo
     """
     dense = subdivide(line, _STEP_M)
     size_px = (camera.width, camera.height)
+    # Visible part of each segment in pixels (m, 2, 2), its depth, and the index of the segment.
     segments, _, index = project_segments(
         dense[:-1], dense[1:], img_from_frame=camera.img_from_frame, size_px=size_px
     )

@@ -90,10 +90,12 @@ def write_drive_film(
 
     Raises:
         FileNotFoundError: If a file does not exist.
-        ValueError: If there is no such scene, a file is malformed or does not fit the others, or an
-            image is missing or damaged.
+        ValueError: If there is no result or no such scene, a file is malformed or does not fit the
+            others, or an image is missing or damaged.
         RuntimeError: If ``av`` (PyAV) is missing.
     """
+    if not results:
+        raise InputError("results must name at least one result file.")
     file = AnnotationFile(annotations)
     scenes = list(dict.fromkeys(file.column("scene")))  # without repetition, in their order
     scene = scenes[0] if scene is None else scene

@@ -1,4 +1,7 @@
-"""Plots of results, of uncertainty and of robustness, in one style."""
+"""Plots of results, of uncertainty and of robustness, in one style.
+
+Figures are created without pyplot, which would keep them in memory. The caller saves them.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -27,6 +30,7 @@ def panel_grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     Returns:
         Figure and its axes. (rows, columns)
     """
+    # Panels are about as high as wide, with 0.3 inches for the title, but at most 2.8 inches high.
     height_in = rows * min(2.8, 0.3 + WIDTH_IN / columns)
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=200, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
@@ -48,7 +52,8 @@ def finish_panel(
         x_label: Quantity along x, with its unit.
         y_label: Quantity along y, with its unit.
         colour: Colour of the title.
-        legend: Options of the legend, such as its location.
+        legend: Options of the legend, such as its location. There is a legend only if the data have
+            labels.
     """
     ax.set_title(title, fontsize=9, loc="left", color=colour)
     ax.set_xlabel(x_label, fontsize=8)
@@ -80,11 +85,12 @@ def finish_shares(ax: Axes, title: str, x_label: str, y_label: str, colour: str 
 def plot_result(reports: Sequence[MetricReport]) -> Figure:
     """Plot precision over recall of each class, and the calibration of the scores.
 
-    The figure has a row for each metric. Lines have the colours of their classes, and are paler for
-    stricter thresholds.
+    The figure has a row for each metric, with a panel for each class and a panel for the
+    calibration. Lines have the colours of their classes, and are paler for stricter thresholds.
+    Their labels are the threshold and the AP in percent.
 
     Args:
-        reports: Reports of one result, one per metric.
+        reports: Reports of one result, one per metric, all with equal classes.
 
     Returns:
         Figure.
@@ -93,15 +99,16 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
     figure, axes = panel_grid(len(reports), len(style.classes) + 1)
     for row, report in zip(axes, reports, strict=True):
         calibration_panel = row[-1]
-        # The last threshold is the loosest distance, but the strictest overlap.
+        # Thresholds ascend. The last one is the loosest distance, but the strictest overlap.
         loosest = -1 if report.by_distance else 0
+        # The diagonal is perfect calibration.
         calibration_panel.plot([0, 1], [0, 1], color=style.grid, linewidth=1)
         for label, (name, detections) in enumerate(report.detections.items()):
             panel = row[label]
             colour = style.colour(label)
             num_thresholds = len(detections.thresholds)
             for index, threshold in enumerate(detections.thresholds):
-                # From 1 for the strictest threshold; thresholds are in rising order.
+                # From 1 for the strictest threshold.
                 rank = index + 1 if report.by_distance else num_thresholds - index
                 ap = 100 * report.metrics[f"{report.name}/{name}/AP@{threshold}"]
                 recall, precision = precision_recall(detections.hits[:, index], detections.num_gts)
@@ -117,10 +124,10 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
                 panel,
                 style.title(label),
                 x_label="recall",
-                y_label="" if label else f"{report.name}: precision",
+                y_label="" if label else f"{report.name}: precision",  # only in the first panel
                 colour=colour,
             )
-            # `reliability` is for scores of detections, and `coverage` for intervals of vertices.
+            # Mean score and share of hits in each bin of scores, at the loosest threshold.
             score, share, _ = reliability(detections.scores, detections.hits[:, loosest])
             calibration_panel.plot(score, share, "o-", markersize=3, color=colour)
         finish_shares(calibration_panel, "calibration", x_label="score", y_label="share of hits")
@@ -130,14 +137,15 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
 def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "normal") -> Figure:
     """Plot coverage of intervals and sparsification, in one row for errors along and one across.
 
-    Coverage is the share of errors within an interval that the sigmas predict.
+    Coverage is the share of errors that lie within an interval which, by the sigmas and the law,
+    contains a given share of the errors. In a calibrated model, both shares are equal.
 
     Sparsification is the mean error of the remaining vertices when the vertices with the largest
     sigma are removed. The pale curve below it is the optimum: the vertices with the largest errors
     are removed.
 
     Args:
-        vertices: Matched vertices.
+        vertices: Vertices of matched predictions, with errors and sigmas along and across the line.
         classes: Class names in label order.
         law: Distribution of the errors, ``normal`` or ``laplace``.
 
@@ -147,17 +155,19 @@ def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "nor
     style = MapStyle(tuple(classes))
     figure, axes = panel_grid(len(AXES), 2)
     for axis, (name, (left, right)) in enumerate(zip(AXES, axes, strict=True)):
-        left.plot([0, 1], [0, 1], color=style.grid, linewidth=1)
+        left.plot([0, 1], [0, 1], color=style.grid, linewidth=1)  # perfect calibration
         for label, title in enumerate(classes):
-            of_class = vertices.select(vertices.labels == label)
-            if not len(of_class.labels):
+            class_vertices = vertices.select(vertices.labels == label)
+            if not len(class_vertices.labels):
                 continue
-            errors = of_class.errors[:, axis]
-            sigmas = of_class.sigmas[:, axis]
+            errors = class_vertices.errors[:, axis]
+            sigmas = class_vertices.sigmas[:, axis]
             colour = style.colour(label)
+            # Share of the errors within the interval of each of `LEVELS`, the predicted shares.
             covered = coverage(errors, sigmas, law)
             left.plot(LEVELS, covered, label=title, color=colour, linewidth=1.3)
-            # Entry k - 1 of a curve is the mean error of the k vertices that remain.
+            # Entry k - 1 of a curve is the mean error of the k vertices that remain, out of the
+            # order of the second argument of `sparsification`, the smallest first.
             removed = 1 - np.arange(1, len(errors) + 1) / len(errors)
             optimum = sparsification(errors, errors)
             right.plot(removed, optimum, alpha=0.3, color=colour, linewidth=1.3)

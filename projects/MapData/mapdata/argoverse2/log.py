@@ -21,10 +21,12 @@ RING_CAMERAS = (
     "ring_front_center", "ring_front_right", "ring_front_left", "ring_rear_right", "ring_rear_left",
     "ring_side_right", "ring_side_left",
 )  # fmt: skip
+# Longest times between a LiDAR sweep and the image of a ring camera, and between a LiDAR sweep and
+# the image of any camera, by the official API.
 MAX_CAMERA_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_RING_CAM_TIMESTAMP_DIFF)  # 25 ms
 MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 51 ms
 
-POSE_TABLE = "city_SE3_egovehicle.feather"
+POSE_TABLE = "city_SE3_egovehicle.feather"  # file of each log with the poses of the vehicle
 
 # Logs with an unusable map or unusable sensor data.
 BROKEN_LOGS = (
@@ -38,7 +40,7 @@ MAP_CHANGE_LOGS = (
 
 
 def _read_feather(path: Path) -> Any:
-    """Read a table as a pandas data frame.
+    """Read and validate a table as a pandas data frame.
 
     Raises:
         ArrowException: If the table is damaged.
@@ -63,16 +65,20 @@ class Argoverse2Log:
 
         Raises:
             FileNotFoundError: If the pose table is missing.
-            ValueError: If the table is damaged, or a pose is not finite.
+            ValueError: If the table is damaged or empty, a translation is not finite, or a
+                quaternion does not have the length 1.
         """
         path = self.log_dir / POSE_TABLE
         if not path.is_file():
             raise FileNotFoundError(f"no poses at {path}: download the log again.")
+        # `explain_errors` adds the path and the advice to errors about the content of the file.
         with explain_errors(path, "download the log again"):
             table = _read_feather(path)
+            # The first pose of each time is kept.
             table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
+            # A rotation has a quaternion of length 1. The comparison is false for NaN, too.
             is_valid = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 1e-3
             is_valid &= np.isfinite(translations).all(axis=1)
             num_invalid = int((~is_valid).sum())
@@ -97,7 +103,11 @@ class Argoverse2Log:
 
     @cached_property
     def calibration(self) -> dict[str, PinholeCamera]:
-        """Calibrated ring cameras by name; empty if the log has no calibration."""
+        """Calibrated ring cameras by name; empty if the log has no calibration.
+
+        Raises:
+            ValueError: If a calibration file is damaged.
+        """
         folder = self.log_dir / "calibration"
         intrinsics_path = folder / "intrinsics.feather"
         extrinsics_path = folder / "egovehicle_SE3_sensor.feather"
@@ -151,13 +161,15 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
     Args:
         root: Data root. The folder of the split is ``root/split`` or ``root/sensor/split``.
         split: ``train``, ``val`` or ``test``.
-        logs: Ids, or first characters of ids, of the logs to take; empty takes all.
+        logs: Ids, or first characters of ids, of the logs to take; an empty sequence takes all
+            logs.
 
     Returns:
         Folders of the logs, sorted.
 
     Raises:
-        FileNotFoundError: If the split is missing, or no log begins with one of ``logs``.
+        FileNotFoundError: If the split is missing or has no log, or one of ``logs`` is the
+            beginning of no id.
     """
     folder = _split_folder(root, split)
     if folder is None:
@@ -194,7 +206,7 @@ def find_all_logs(root: Path) -> list[Path]:
 
 
 def _split_folder(root: Path, split: str) -> Path | None:
-    """Folder of an official split; None if it is missing."""
+    """Folder of an official split, in one of the two places where it may be; None if missing."""
     for folder in (root / split, root / "sensor" / split):
         if folder.is_dir():
             return folder
@@ -202,7 +214,11 @@ def _split_folder(root: Path, split: str) -> Path | None:
 
 
 def _logs_of_split(folder: Path) -> list[Path]:
-    """Sorted subfolders with a map or a pose table, without unfinished folders."""
+    """Sorted subfolders with a map or a pose table.
+
+    Folders that a program of this project has not finished have the ending ``PARTIAL_SUFFIX``, and
+    are left out.
+    """
     log_dirs = set()
     for part in ("map", POSE_TABLE):
         for path in folder.glob(f"*/{part}"):
@@ -217,7 +233,7 @@ def logs_in(folder: Path) -> list[Path]:
     Returns:
         Sorted folders of the logs at the first level that has any; empty if there are no logs.
     """
-    for depth in range(4):
+    for depth in range(4):  # depth 0 is the folder itself
         pattern = "*/" * depth + POSE_TABLE
         pose_tables = sorted(folder.glob(pattern))
         if pose_tables:

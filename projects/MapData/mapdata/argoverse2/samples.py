@@ -47,8 +47,8 @@ class Argoverse2Options(FileOptions):
             for ``train`` and 2.5 Hz (every fourth sweep) for the other splits.
         thin_over: Samples that are thinned out together: the samples of one ``log``, or of the
             whole ``split`` sorted by time (`thin_out_split`).
-        compat: Rules of the ground truth, one of ``COMPAT_MODES``: the published systems whose
-            elements the conversion reproduces.
+        compat: Rules of the ground truth: the published system whose elements the conversion
+            reproduces, ``maptrv2`` or ``maptr``.
         dim: Coordinates per point, 2 or 3.
         logs: Ids, or first characters of ids, of the logs to convert; empty converts all.
         keep_map_changes: Whether to keep the logs whose map was changed on purpose.
@@ -72,9 +72,11 @@ class Argoverse2Options(FileOptions):
     y_range: tuple[float, float] = RANGES["ego"][1]
 
     def __post_init__(self) -> None:
+        # `pose_stride` is None for a text that is not poses:N, too.
         if self.at not in ("auto", "lidar", "cameras") and self.pose_stride is None:
             raise InputError(f"at must be auto, lidar, cameras or poses:N, got {self.at!r}.")
         if self.rate_hz == "published":  # type: ignore[comparison-overlap]
+            # The class is frozen, so a plain assignment would raise an error.
             object.__setattr__(self, "rate_hz", 10.0 if self.split == "train" else 2.5)
         if self.rate_hz is not None and not self.rate_hz > 0:
             raise InputError(f"rate_hz must be > 0, got {self.rate_hz}.")
@@ -88,7 +90,7 @@ class Argoverse2Options(FileOptions):
             )
         if self.dim not in (2, 3):
             raise InputError(f"dim must be 2 or 3, got {self.dim}.")
-        check_rules(self.classes, self.compat)
+        check_rules(self.classes, self.compat)  # raises a ValueError for unknown names
 
     @property
     def pose_stride(self) -> int | None:
@@ -105,7 +107,7 @@ class LogSamples:
         samples: Samples in ascending order of time.
         left_out: Number of unusable samples, by reason.
         invalid: Number of invalid polygons of the map, by kind.
-        elements: Ids of the unusable elements of the map, by kind and reason.
+        elements: Ids of the unusable elements of the map, by a text with their kind and the reason.
     """
 
     samples: list[MapSample] = field(default_factory=list)
@@ -149,6 +151,8 @@ def read_log(
         if timestamp_ns in excluded_ns:
             continue
         try:
+            # Errors about damaged content get the folder and this advice. `_UnusableSample` passes
+            # unchanged.
             with explain_errors(log_dir, "download the log again"):
                 sample = _sample(log, log_map, timestamp_ns=timestamp_ns, options=options)
         except _UnusableSample as reason:
@@ -172,7 +176,7 @@ def usable_times(log_dir: Path, options: Argoverse2Options) -> list[int]:
     times_ns = []
     try:
         for timestamp_ns in sample_times(log, options).tolist():
-            with suppress(_UnusableSample):
+            with suppress(_UnusableSample):  # then the time is not added
                 _sample(log, None, timestamp_ns=timestamp_ns, options=options)
                 times_ns.append(timestamp_ns)
     except (OSError, ValueError):  # the conversion of the log reports this error
@@ -198,6 +202,7 @@ def thin_out_split(times_ns: Mapping[str, Sequence[int]], rate_hz: float) -> dic
     samples = []
     for name, log_times in times_ns.items():
         gaps_ns.append(np.diff(log_times))
+        # Samples of equal times are sorted by the name of the log.
         samples += [(time, name) for time in log_times]
     all_gaps_ns = np.concatenate(gaps_ns)
     step = 1
@@ -221,7 +226,8 @@ def read_logs(
         rate_hz: Samples per second; None takes a sample per LiDAR sweep or image.
 
     Returns:
-        The samples, and the number of logs and samples that are left out, by reason.
+        The samples, and the number of logs and samples that are left out, by the name of the log
+        with the reason.
 
     Raises:
         ValueError: If no log has a usable sample.
@@ -256,10 +262,12 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
         Ascending times in nanoseconds. (n,)
 
     Raises:
-        ValueError: If the calibration or the sensor data that ``options.at`` needs are missing.
+        FileNotFoundError: If the poses are needed and missing.
+        ValueError: If the calibration or the sensor data that ``options.at`` needs are missing, or
+            a file is damaged.
     """
     if options.pose_stride is not None:
-        return np.array(list(log.poses))[:: options.pose_stride]
+        return np.array(list(log.poses))[:: options.pose_stride]  # the keys are ascending times
     uncalibrated = [name for name in RING_CAMERAS if name not in log.calibration]
     if uncalibrated:
         cameras = ", ".join(uncalibrated) if log.calibration else "the ring cameras"
@@ -267,7 +275,7 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
     times_ns = log.lidar_timestamps_ns
     kind = "LiDAR sweeps"
     if options.at == "cameras" or (options.at == "auto" and len(times_ns) == 0):
-        times_ns = log.image_timestamps_ns[RING_CAMERAS[0]]
+        times_ns = log.image_timestamps_ns[RING_CAMERAS[0]]  # the front camera
         kind = f"images of {RING_CAMERAS[0]}"
     if len(times_ns) == 0:
         raise InputError(f"no {kind} ({_ALTERNATIVE})")
@@ -311,12 +319,13 @@ def _sample(
     """Make the sample at a time.
 
     Raises:
-        _UnusableSample: If the pose at this time or an image is missing.
+        _UnusableSample: If the pose at this time is missing, or an image that ``options.at`` needs.
+        ValueError: If a file is damaged.
     """
     city_from_ego = log.poses.get(timestamp_ns)
     if city_from_ego is None:
         raise _UnusableSample("no pose at the sample's time")
-    ego_from_city = np.linalg.inv(city_from_ego)
+    ego_from_city = np.linalg.inv(city_from_ego)  # ego at the time of the sample
     sample = MapSample(
         token=f"{log.log_id}_{timestamp_ns}",
         scene=log.log_id,
@@ -328,6 +337,7 @@ def _sample(
     )
     if log_map is not None:
         with explain_errors(find_map(log.log_dir), "download it again"):
+            # Vertices in the ego frame, a list of elements by class. (n, 3) each
             elements = log_map.extract(
                 city_from_ego,
                 options.classes,
@@ -356,6 +366,7 @@ def _cameras(
     records = []
     for name, camera in log.calibration.items():
         camera_times_ns = log.image_timestamps_ns[name]
+        # None if no image of the camera is close enough.
         image_ns = closest_ns(camera_times_ns, timestamp_ns, tolerance_ns=MAX_CAMERA_OFFSET_NS)
         city_from_ego_at_image = None if image_ns is None else log.poses.get(image_ns)
         if city_from_ego_at_image is None:
@@ -382,8 +393,9 @@ def _lidar(
 ) -> LidarRecord | None:
     """Find the LiDAR sweep closest in time, and the sweeps before it.
 
-    The result is None if no sweep is close enough, or if the closest sweep has no pose.
-    Argoverse 2 stores the points of a sweep in the ego frame at the time of the sweep.
+    There are at most ``options.max_sweeps`` earlier sweeps, the latest first. Sweeps without a pose
+    are left out. The result is None if no sweep is close enough, or if the closest sweep has no
+    pose. Argoverse 2 stores the points of a sweep in the ego frame at the time of the sweep.
     """
     times_ns = log.lidar_timestamps_ns
     sweep_ns = closest_ns(times_ns, timestamp_ns, tolerance_ns=MAX_LIDAR_OFFSET_NS)

@@ -19,7 +19,7 @@ _VALUES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _TIME = "timestamp_ns"
 _FRAME = "frame"
 _SEPARATORS = ",;\t"
-_NUMBER = re.compile(r"(-?\d+)(\.0*)?")
+_NUMBER = re.compile(r"(-?\d+)(\.0*)?")  # a whole number, also with zeros as decimals
 _LENGTH_TOLERANCE = 1e-2  # largest difference of a quaternion's length from 1
 _MOST_COLUMNS = 12  # largest number of columns that a message names
 
@@ -27,27 +27,30 @@ _MOST_COLUMNS = 12  # largest number of columns that a message names
 def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> PoseTrack:
     """Read poses from the columns x, y, z, qw, qx, qy, qz, and timestamp_ns or frame.
 
-    The column ``frame`` has the names of images, whose times are the times of the poses. Columns
-    are separated by commas, semicolons or tabs, and blanks around values are ignored. In files with
+    The column ``frame`` has the names of images, whose times are the times of the poses. It has
+    precedence over ``timestamp_ns``. Rows with the name of no image are skipped. Columns are
+    separated by commas, semicolons or tabs, and blanks around values are ignored. In files with
     semicolons or tabs, numbers may have decimal commas.
 
     Args:
-        path: Text file, whose first line names the columns.
+        path: Text file, whose first line that is not blank names the columns.
         time_of: Times of the images in nanoseconds, by their names without suffix.
-        ground: Pose of the road in the vehicle's frame, in metres. (4, 4)
+        ground: Transform from the road below the vehicle to the vehicle's frame, in metres. (4, 4)
 
     Returns:
-        Poses of the road below the vehicle.
+        Poses of the road below the vehicle in the global frame of the file, by time.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If the file is malformed; the message names the line.
+        ValueError: If the file is malformed, or has no pose of an image. The message names the file
+            and, for an invalid value, the line.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no file of poses {path}.")
     times_ns = []
-    values = []
+    pose_values = []  # 7 numbers of each pose
     unknown_frames = []
+    # The context adds the path and the remedy to the messages below.
     with explain_errors(path, remedy="see docs/inference.md"):
         for number, row in _rows(read_text(path)):
             try:
@@ -55,7 +58,7 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
                 if time_ns is None:
                     unknown_frames.append(row[_FRAME])
                     continue
-                values.append(_pose_of(row))
+                pose_values.append(_pose_of(row))
             except ValueError as error:
                 raise InputError(f"line {number}: {error}") from error
             times_ns.append(time_ns)
@@ -66,9 +69,9 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
             )
         if not times_ns:
             raise InputError("it holds no pose")
-        rows = np.array(values, dtype=np.float64)
-        positions = rows[:, :3]
-        quaternions_xyzw = rows[:, [4, 5, 6, 3]]
+        table = np.array(pose_values, dtype=np.float64)
+        positions = table[:, :3]
+        quaternions_xyzw = table[:, [4, 5, 6, 3]]  # SciPy's order; the file begins with w
         rotations = Rotation.from_quat(quaternions_xyzw).as_matrix()
         poses = []
         for rotation, position in zip(rotations, positions, strict=True):
@@ -77,7 +80,7 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
 
 
 def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the number and the values by column of each line below the first."""
+    """Yield the line number and the values by column of each row below the names of the columns."""
     lines = text.splitlines()
     # Index of the first line that is not blank.
     start = next((number for number, line in enumerate(lines) if line.strip()), None)
@@ -97,7 +100,7 @@ def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
                 raise InputError(f"line {number}: it has {len(values)} of {len(names)} columns")
             if separator != ",":
                 values = [value.replace(",", ".") for value in values]
-            yield number, dict(zip(names, values, strict=False))
+            yield number, dict(zip(names, values, strict=False))  # further values are ignored
     except csv.Error as error:
         raise InputError(f"it is no CSV: {error}") from error
 
@@ -124,6 +127,7 @@ def _time_of(row: Mapping[str, str], time_of: Mapping[str, int]) -> int | None:
     match = _NUMBER.fullmatch(text)
     if match:
         return int(match[1])
+    # Scientific notation, such as 1.56E+18.
     if re.fullmatch(r"\d([.,]\d+)?[eE]\+?\d+", text):
         raise InputError(
             f"{_TIME} is {text!r:.40}, rounded as spreadsheets write long numbers: keep its digits"
@@ -138,7 +142,7 @@ def _pose_of(row: Mapping[str, str]) -> list[float]:
         try:
             value = float(row[name])
         except ValueError:
-            value = math.nan
+            value = math.nan  # reported below, like a number that is not finite
         if not math.isfinite(value):
             raise InputError(f"{name} is {row[name]!r:.40}, no finite number")
         values.append(value)

@@ -1,4 +1,8 @@
-"""Cameras on a vehicle, its poses over time, and the samples of a drive."""
+"""Cameras on a vehicle, its poses over time, and the samples of a drive.
+
+A rig is the set of cameras on a vehicle. Rectification removes the distortion of an image, so that
+it becomes an image of a pinhole camera.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,13 +23,17 @@ from gsmap.utils.files import write_bytes
 from mapdata.argoverse2.log import closest_ns
 
 PoseAt = Callable[[int], np.ndarray | None]
-"""Function from a time in nanoseconds to the pose (4, 4) of the vehicle, or None."""
+"""Function from a time in nanoseconds to the pose (4, 4) of the ground below the vehicle.
+
+It returns None if no pose is known near this time.
+"""
+# Names of distortion models in ROS. OpenCV has separate functions for the two groups.
 FISHEYE_MODELS = ("equidistant", "fisheye")
 PLAIN_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "")
 # Valid numbers of distortion coefficients, by distortion model.
 _COUNTS = dict.fromkeys(PLAIN_MODELS, (4, 5, 8, 12, 14)) | dict.fromkeys(FISHEYE_MODELS, (4,))
 _LEAST_SHARE = 0.1  # smallest share of a rectified image that the original image covers
-_GRID = 16  # width and height in pixels of the image on which this share is measured
+_GRID = 16  # width and height in pixels of the small image on which this share is measured
 
 
 @dataclass
@@ -46,7 +54,8 @@ class RigCamera:
 
     Raises:
         ValueError: If the size is not positive, or images cannot be rectified with the given
-            distortion.
+            distortion: its model is unknown, its coefficients are invalid, or they leave almost no
+            image.
     """
 
     name: str
@@ -76,6 +85,7 @@ class RigCamera:
             self._check_distortion()
 
     def _check_distortion(self) -> None:
+        """Raise a ValueError if images cannot be rectified; drop zeros behind the coefficients."""
         where = f"camera {self.name!r}"
         if self.model not in _COUNTS:
             raise InputError(
@@ -107,8 +117,10 @@ class RigCamera:
 
     def _covered_share(self) -> float:
         """Approximate share of a rectified image that the original image covers, in [0, 1]."""
+        # Both modules have a function of this name, each for its distortion models.
         lens = cv2.fisheye if self.model in FISHEYE_MODELS else cv2
         width, height = self.size_px
+        # The pinhole matrix of the image, scaled down to the small image.
         small_intrinsics = np.diag([_GRID / width, _GRID / height, 1.0]) @ self.intrinsics
         # x and y are the position of each pixel of a small rectified image in the original image.
         x, y = lens.initUndistortRectifyMap(
@@ -122,7 +134,7 @@ class RigCamera:
         return float(((x >= 0) & (x < width) & (y >= 0) & (y < height)).mean())
 
     def rectify(self, image: np.ndarray) -> np.ndarray:
-        """Remove the distortion of an image. (H, W, 3)"""
+        """Remove the distortion of an image. (H, W, 3) -> (H, W, 3)"""
         if self.model in FISHEYE_MODELS:
             return cv2.fisheye.undistortImage(
                 image, self.intrinsics, self.distortion, Knew=self.rectified_intrinsics
@@ -132,11 +144,11 @@ class RigCamera:
         )
 
     def write_image(self, path: Path, image: np.ndarray) -> None:
-        """Write an image without distortion as JPEG.
+        """Rectify an image if the camera is distorted, and write it as JPEG.
 
         Args:
             path: File to write.
-            image: Image in BGR. (H, W, 3)
+            image: Image of the camera in BGR. (H, W, 3)
         """
         if self.is_distorted:
             image = self.rectify(image)
@@ -156,16 +168,19 @@ def set_rectification_targets(
         Names and intrinsics of the cameras with a target, as bytes. Callers add them to the digest
         that names the rectified images. Empty if no camera has a target.
     """
-    key = ""
+    text = ""  # a line for each camera with a target
     for camera in rig:
         if camera.is_distorted and camera.name in trained:
             camera.trained = tuple(trained[camera.name])
-            key += f"{camera.name} {camera.trained}\n"
-    return key.encode()
+            text += f"{camera.name} {camera.trained}\n"
+    return text.encode()
 
 
 def rotation_of(wxyz: Iterable[Any]) -> np.ndarray:
     """Rotation matrix of a quaternion. (3, 3)
+
+    Args:
+        wxyz: Four numbers, w first, or texts of numbers.
 
     Raises:
         ValueError: If the length of the quaternion is not 1.
@@ -219,7 +234,7 @@ class PoseTrack:
         if self.holds and after == count:
             return self.poses[-1]
         if after in (0, count):  # before the first pose or after the last one
-            nearest = max(after - 1, 0)
+            nearest = max(after - 1, 0)  # index of the first or last pose
             is_near = abs(int(self.times_ns[nearest]) - time_ns) <= self.gap_ns // 10
             return self.poses[nearest] if is_near else None
         start_ns = int(self.times_ns[after - 1])
@@ -229,6 +244,8 @@ class PoseTrack:
         if end_ns - start_ns > self.gap_ns:
             return start_pose if self.holds else None
         share = (time_ns - start_ns) / (end_ns - start_ns)
+        # Positions are interpolated linearly. The rotation is then replaced, because the weighted
+        # mean of two rotation matrices is no rotation.
         pose = (1 - share) * start_pose + share * end_pose
         rotations = Rotation.from_matrix([start_pose[:3, :3], end_pose[:3, :3]])
         pose[:3, :3] = Slerp([0.0, 1.0], rotations)(share).as_matrix()
@@ -241,8 +258,9 @@ class RigFrame:
 
     Args:
         token: Unique name.
-        time_ns: Time of the frame.
-        images: Path relative to the data root, and time in nanoseconds, by camera.
+        time_ns: Time of the frame in nanoseconds.
+        images: Path relative to the data root, and time in nanoseconds, of the image of each
+            camera, by its name. Cameras without an image are left out.
     """
 
     token: str
@@ -256,12 +274,13 @@ def nearest_images(
     """Find the image of each camera that is nearest to each wanted time, within a tolerance.
 
     Args:
-        times_ns: Times of the images by camera, ascending. each (n,)
-        wanted_ns: Wanted times. (m,)
-        tolerance_ns: Largest difference of the times.
+        times_ns: Times of the images in nanoseconds by camera, ascending. each (n,)
+        wanted_ns: Wanted times in nanoseconds. (m,)
+        tolerance_ns: Largest difference of the times in nanoseconds.
 
     Returns:
-        For each wanted time, the times of the images by camera. (m,)
+        For each wanted time, the times of the images by camera. Cameras without an image within the
+        tolerance are left out. (m,)
     """
     frames = []
     for wanted in wanted_ns:
@@ -277,7 +296,7 @@ def nearest_images(
 def rig_samples(
     scene: str, rig: Sequence[RigCamera], frames: Sequence[RigFrame], pose_at: PoseAt | None
 ) -> list[MapSample]:
-    """Create the samples of a drive, in the frame ``ego``.
+    """Create the samples of a drive, in the annotation frame ``ego``.
 
     Args:
         scene: Name of the drive.
@@ -307,6 +326,7 @@ def rig_samples(
             image_pose = None if pose_at is None else pose_at(time_ns)
             cam_from_ground = camera.cam_from_ground
             # The vehicle moves between the time of the frame and the time of the image.
+            # If the pose at either time is unknown, this motion is neglected.
             if image_pose is not None and pose is not None:
                 cam_from_ground = cam_from_ground @ invert_rigid(image_pose) @ pose
             width, height = camera.size_px
@@ -319,6 +339,7 @@ def rig_samples(
                 cam_from_frame=cam_from_ground,
             )
             cameras.append(record)
+        # Converts the transforms from the ground to the frame ``ego``.
         sample = sample_in_vehicle(
             token=frame.token,
             scene=scene,
@@ -327,5 +348,6 @@ def rig_samples(
             global_from_ground=pose,
         )
         samples.append(sample)
+    # The samples must meet the rules for annotation files, although no file is written here.
     check_samples(samples, AnnotationMeta(dataset="recording", frame="ego", split="test"))
     return samples

@@ -3,6 +3,10 @@
 MapTR's ``nuscenes_infos_temporal_*.pkl`` contain sensors and poses; their ground truth is made from
 the map expansion. MapTRv2's ``nuscenes_map_infos_temporal_*.pkl`` and ``av2_map_infos_*.pkl`` also
 contain the ground truth. No code from the pickles is run.
+
+An entry of an info file is a dictionary of one sample. The annotation frame, in which the ground
+truth is given, is the frame of the LiDAR for nuScenes, and the frame of the vehicle (ego) for
+Argoverse 2. A transform ``b_from_a`` converts coordinates in frame a to frame b.
 """
 
 import argparse
@@ -50,14 +54,22 @@ _NEEDED = {
     "img_fpath, intrinsics and extrinsics",
 }
 _MAPTRV2 = {"timestamp", "log_id", "lidar_path"}  # fields of MapTRv2's samples of Argoverse 2
-_BEYOND_M = 1.0  # tolerance of the range; roll and pitch move clipped points by centimetres
+# Tolerance of the range in metres. Roll and pitch of the vehicle move points at the limits of the
+# range by centimetres after they were clipped.
+_BEYOND_M = 1.0
 
 
 def _relative(path: str, root: Path) -> str:
     """Convert a path in an info file to a path relative to the data root.
 
-    The info file may be from another computer, with another data root.
+    The info file may be from another computer, with another data root. If the file exists below the
+    data root, its path there is returned. Otherwise the result begins at a folder that is usual in
+    the data sets.
+
+    Raises:
+        ValueError: If no relative path can be found.
     """
+    # The longest end of the path that is a file below the data root, or None
     existing = find_file(path, root)
     if existing is not None:
         return existing.as_posix()
@@ -65,19 +77,21 @@ def _relative(path: str, root: Path) -> str:
     parts = posix_path.parts
     for anchor in ("samples", "sweeps", "train", "val", "test"):
         if anchor in parts:  # keep the parts from its last occurrence on
+            # Tuples have no search from the end, so the reversed parts are searched.
             last_anchor = len(parts) - 1 - parts[::-1].index(anchor)
             parts = parts[last_anchor:]
             break
-    suffix = Path(*parts)
-    if not suffix.is_absolute() and ".." not in parts:
-        return suffix.as_posix()
+    relative_path = Path(*parts)
+    if not relative_path.is_absolute() and ".." not in parts:
+        return relative_path.as_posix()
     raise InputError(f"path {path!r} does not lie under {root}: give the right --data-root.")
 
 
 def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance] | None:
     """Ground truth of an entry of an info file; None if the entry has none.
 
-    Lines of one point are left out.
+    Lines of one point are left out. Further coordinates than the dimension of the annotation file
+    are left out as well.
     """
     annotation = info.get("annotation")
     if annotation is None:
@@ -112,6 +126,9 @@ class _ImageSizes:
 
         Returns:
             Width and height in pixels.
+
+        Raises:
+            ValueError: If the file is not an image, or has too many pixels.
         """
         if (scene, camera) in self._sizes:
             return self._sizes[scene, camera]
@@ -119,7 +136,7 @@ class _ImageSizes:
             width, height = NUSCENES_SIZE
             reason = f"image not there (assumed to have {width} x {height} pixels)"
             self._summary.add_problem(f"{camera}: {reason}", str(file))
-            return NUSCENES_SIZE
+            return NUSCENES_SIZE  # not stored, as the next image of the camera may exist
         size = image_size(file, f"camera {camera}")
         self._sizes[scene, camera] = size
         return size
@@ -129,6 +146,8 @@ def _nuscenes_sample(
     info: Mapping[str, Any], meta: AnnotationMeta, root: Path, image_sizes: _ImageSizes
 ) -> MapSample:
     """Make a sample in the LIDAR_TOP frame from an entry of a nuScenes info file."""
+    # `pose_of` makes a matrix (4, 4) from the entries ``<prefix>translation`` and
+    # ``<prefix>rotation``.
     ego_from_frame = pose_of(info, "lidar2ego_")
     global_from_ego = pose_of(info, "ego2global_")
     scene = str(info.get("scene_token", ""))
@@ -151,6 +170,7 @@ def _nuscenes_sample(
     for sweep in info.get("sweeps", []):
         sweep_record = SweepRecord(
             path=_relative(sweep["data_path"], root),
+            # nuScenes has times in microseconds.
             timestamp_ns=in_nanoseconds(sweep["timestamp"], usual_unit_ns=1000),
             frame_from_lidar=pose_of(sweep, "sensor2lidar_"),
         )
@@ -158,8 +178,8 @@ def _nuscenes_sample(
     can_bus = info.get("can_bus")
     if can_bus is not None:
         # The signals are position (3), quaternion (4), measurements (9) and yaw (2). Only the
-        # measurements are taken from the file. The others follow from the pose, as when MapTR loads
-        # the file.
+        # measurements are taken from the file. The others are computed from the pose of the
+        # vehicle, as MapTR does when it loads the file.
         measurements = np.asarray(can_bus, np.float64)[7:16]
         can_bus = pose_signals(global_from_ego)
         can_bus[3:7] = np.asarray(info["ego2global_rotation"])
@@ -172,6 +192,7 @@ def _nuscenes_sample(
         cameras=cameras,
         global_from_frame=global_from_ego @ ego_from_frame,
         ego_from_frame=ego_from_frame,
+        # The frame of the LiDAR is the annotation frame, hence the identity.
         lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4), sweeps=sweeps),
         can_bus=can_bus,
         instances=_instances(info, meta),
@@ -183,10 +204,13 @@ def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path)
     global_from_ego = pose_of(info, "e2g_")
     cameras = []
     for name, camera in info["cams"].items():
+        # The vehicle moves between the time of the sample and the time of the image. Without a pose
+        # at the time of the image, the pose of the sample is taken.
         global_from_ego_at_image = global_from_ego
         if "e2g_translation" in camera:
             global_from_ego_at_image = pose_of(camera, "e2g_")
         path = _relative(camera["img_fpath"], root)
+        # Usual size, for a missing image
         width, height = _RING_FRONT_SIZE if name == "ring_front_center" else _RING_SIZE
         if (root / path).is_file():
             width, height = image_size(root / path, f"camera {name}")
@@ -210,6 +234,7 @@ def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path)
         timestamp_ns=in_nanoseconds(info["timestamp"], usual_unit_ns=1),
         cameras=cameras,
         global_from_frame=global_from_ego,
+        # Sweeps of Argoverse 2 are given in the frame of the vehicle, hence the identity.
         lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4)),
         instances=_instances(info, meta),
     )
@@ -224,11 +249,15 @@ def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
 
     Returns:
         The entries, and the annotation frame: ``lidar`` (nuScenes) or ``ego`` (Argoverse 2).
+
+    Raises:
+        ValueError: If the content has another form, or no entry.
     """
     # Samples of StreamMapNet and MapTracker also have the key ``e2g_translation``, but lack other
     # keys of MapTRv2. They are listed under ``samples``, or the whole content is the list.
     entries = content.get("samples", ()) if isinstance(content, Mapping) else content
     first = entries[0] if isinstance(entries, list) and entries else None
+    # ``>=`` between sets of keys: whether the sample has all keys of MapTRv2
     if isinstance(first, Mapping) and "e2g_translation" in first and not first.keys() >= _MAPTRV2:
         missing = ", ".join(sorted(_MAPTRV2 - first.keys()))
         raise InputError(
@@ -266,9 +295,13 @@ def _samples(
         infos: Path of the info file, for messages.
         root: Data root.
         summary: Summary that counts the samples and problems.
+
+    Raises:
+        ValueError: If an entry lacks a field or has a wrong value, or ground truth lies outside of
+            the range.
     """
 
-    @cache
+    @cache  # each map is read once
     def open_map(name: str) -> NuScenesLocalMap | None:
         if not name or not expansion(root, name).is_file():
             return None
@@ -278,12 +311,15 @@ def _samples(
     image_sizes = _ImageSizes(summary)
     remedy = f"a sample of such a file has {_NEEDED[meta.frame]}"
     for number, info in entries:
+        # Errors about the content of the entry get its position and the remedy.
         with explain_errors(f"{infos}, sample {number}", remedy):
             if meta.frame == "ego":
                 sample = _argoverse_sample(info, meta, root=root)
             else:
                 sample = _nuscenes_sample(info, meta, root=root, image_sizes=image_sizes)
             check_samples([sample], meta)
+        # Ground truth from a map is clipped to the range, so only ground truth of the file is
+        # checked.
         if sample.instances is not None:
             _check_range(sample, meta)
         elif meta.frame == "lidar":
@@ -299,8 +335,8 @@ def _samples(
 
 def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
     """Raise a ``ValueError`` if ground truth lies outside the range of the annotation file."""
-    low, high = np.array([meta.x_range, meta.y_range]).T
-    lines = [np.empty((0, 2))]
+    low, high = np.array([meta.x_range, meta.y_range]).T  # (x, y) each
+    lines = [np.empty((0, 2))]  # an array to concatenate even if there is no instance
     for instance in sample.instances or []:
         lines.append(instance.points[:, :2])
     points = np.concatenate(lines)
@@ -315,12 +351,16 @@ def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
 
 
 def _dim(entries: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> int:
-    """Number of coordinates per point of the first map element, at most 3; 2 without elements."""
+    """Number of coordinates per point of the first map element, at most 3; 2 without elements.
+
+    All elements of a file are assumed to have equal numbers of coordinates.
+    """
     for info in entries:
-        if "annotation" not in info:
+        annotation = info.get("annotation")
+        if annotation is None:
             continue
         for name in classes:
-            for points in info["annotation"][name]:
+            for points in annotation[name]:
                 return min(np.shape(points)[-1], 3)
     return 2
 
@@ -349,7 +389,8 @@ def convert_infos(
             for the usual range of the frame.
         y_range: Smallest and largest y of the ground truth in metres in the annotation frame; None
             for the usual range of the frame.
-        command: Command line that creates the file, for messages of readers of the file.
+        command: Command line that creates the file. It is stored in the file, for messages of
+            programs that read the file.
         shard: Part of the samples to convert.
 
     Returns:
@@ -362,6 +403,7 @@ def convert_infos(
     """
     entries, frame = _entries(load_plain_pickle(infos), infos)
     with explain_errors(infos, "make it again"):
+        # Ground truth of nuScenes is two-dimensional.
         dim = _dim(entries, classes) if frame == "ego" else 2
     usual_x_range, usual_y_range = RANGES[frame]
     meta = AnnotationMeta(
@@ -398,6 +440,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> str:
     """Convert with the options of a command line and return the summary as text."""
+    # The name of an info file ends with the split, as in nuscenes_infos_temporal_val.pkl.
     split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
     summary = convert_infos(
         arguments.infos,

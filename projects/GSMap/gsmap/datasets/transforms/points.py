@@ -19,7 +19,8 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_machine_error
 from gsmap.utils.inputs import check_input
 
-# Columns of Argoverse 2. The first five have the meaning of the values in files of nuScenes.
+# Columns of Argoverse 2. The first five have the meaning of the five values of a point in files of
+# nuScenes.
 FEATHER_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
 
 
@@ -69,12 +70,14 @@ def _read_feather(path: str, load_dim: int) -> np.ndarray:
         )
     names = FEATHER_COLUMNS[:load_dim]
     try:
+        # Files that Python opens are checked automatically, but Arrow opens this file itself. The
+        # check refuses pipes and outputs of the command.
         check_input(path)
         table = feather.read_table(path, columns=list(names), memory_map=False)
-        table.validate(full=True)
+        table.validate(full=True)  # otherwise a damaged table could crash the process
         columns = [table[name].to_numpy().astype(np.float32) for name in names]
     except (pa.ArrowException, OSError, ValueError, TypeError) as error:
-        if is_machine_error(error):
+        if is_machine_error(error):  # such as a lack of memory: the file may be in order
             raise
         raise BrokenSampleError(
             f"{path} is not a whole LiDAR sweep ({error}): download it again."
@@ -87,7 +90,7 @@ def _read_feather(path: str, load_dim: int) -> np.ndarray:
 def _name_sample_in_errors(
     transform: Callable[[dict[str, Any]], dict[str, Any]], results: dict[str, Any]
 ) -> dict[str, Any]:
-    """Apply a transform, and add the token of the sample to an error about a broken file."""
+    """Apply a transform to a sample, and add the sample's token to an error about a broken file."""
     try:
         return transform(results)
     except BrokenSampleError as error:
@@ -96,7 +99,11 @@ def _name_sample_in_errors(
 
 @TRANSFORMS.register_module()
 class LoadLidarPoints(LoadPointsFromFile):
-    """``LoadPointsFromFile`` of mmdet3d with checks and support for files of Argoverse 2."""
+    """``LoadPointsFromFile`` of mmdet3d with checks and support for files of Argoverse 2.
+
+    The base class calls ``_load_points``, which returns the values of all points in one row, and
+    stores the points as ``results["points"]``.
+    """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Load the point file of ``results['lidar_points']``.
@@ -119,7 +126,8 @@ class LoadLidarPoints(LoadPointsFromFile):
 class LoadLidarSweeps(LoadPointsFromMultiSweeps):
     """``LoadPointsFromMultiSweeps`` of mmdet3d with checks and support for files of Argoverse 2.
 
-    The fifth value of each point is replaced by the age of its sweep in seconds.
+    The base class appends the points of earlier sweeps to ``results["points"]``. It replaces the
+    fifth value of each point by the age of the sweep in seconds, which is 0 for the current sweep.
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
@@ -144,11 +152,11 @@ class PointsToFrame(BaseTransform):
     """Transform points from the frame of the LiDAR to the annotation frame.
 
     The transform must come after ``LoadLidarPoints`` and before ``LoadLidarSweeps``. The latter
-    adds the points of earlier sweeps, which it has already transformed to the annotation frame.
+    transforms the points of earlier sweeps to the annotation frame itself before it adds them.
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Apply ``lidar2frame`` to ``points``."""
+        """Apply ``lidar2frame``, the transform (4, 4) to the annotation frame, to ``points``."""
         matrix = results["lidar2frame"]
         if not np.array_equal(matrix, np.eye(4)):
             points = results["points"].clone()
@@ -166,11 +174,13 @@ class MakeDepthMap(BaseTransform):
     """Add ``gt_depth``, the depth in metres of the nearest LiDAR point at each pixel. (V, H, W)
 
     Pixels without a point are 0. The transform must follow all transforms that load points or
-    resize images.
+    resize images, since it projects the points by ``lidar2img``, the projection matrix of each
+    view of the resized images.
 
     Args:
         depth_range: Smallest depth, included, and largest depth, excluded, in metres.
-        pad_size_divisor: Divisor of the image size after the padding before the backbone.
+        pad_size_divisor: The model pads images at the bottom and right until their height and width
+            are multiples of this number. H and W are the padded sizes.
     """
 
     depth_range: tuple[float, float] = (1.0, 60.0)
@@ -185,17 +195,19 @@ class MakeDepthMap(BaseTransform):
         depths = np.zeros((len(results["lidar2img"]), height, width), dtype=np.float32)
         for view, lidar2img in enumerate(results["lidar2img"]):
             projected = homogeneous @ lidar2img.T  # (u * depth, v * depth, depth, 1). (n, 4)
-            u, v, depth = projected[:, :3].T  # u and v are divided by the depth below
+            u_times_depth, v_times_depth, depth = projected[:, :3].T
             in_range = (depth >= min_depth) & (depth < max_depth)
             depth = depth[in_range]
-            col = np.round(u[in_range] / depth)
-            row = np.round(v[in_range] / depth)
-            num_rows, num_cols = results["raw_shapes"][view]  # without padding at bottom and right
+            col = np.round(u_times_depth[in_range] / depth)
+            row = np.round(v_times_depth[in_range] / depth)
+            # Size of the view without padding. Points beside it are not in the picture.
+            num_rows, num_cols = results["raw_shapes"][view]
             is_inside = (col >= 0) & (col < num_cols) & (row >= 0) & (row < num_rows)
             depth = depth[is_inside]
             col = col[is_inside].astype(int)
             row = row[is_inside].astype(int)
-            far_first = np.argsort(-depth, kind="stable")  # the nearest point is written last
+            # If several points fall into one pixel, the nearest one is written last and remains.
+            far_first = np.argsort(-depth, kind="stable")
             depths[view, row[far_first], col[far_first]] = depth[far_first]
         results["gt_depth"] = torch.from_numpy(depths)
         return results

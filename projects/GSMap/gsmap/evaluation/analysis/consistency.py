@@ -5,6 +5,8 @@ ground truth. The rules follow MapTracker's public code. They differ from AP_cha
 predictions with a score of 0.4 or less are left out, a frame without ground truth of a class does
 not count for the class, lines have 200 points, and two lines can match even if the strips of 4 m
 width around them do not touch.
+
+Masks are drawn only to create tracks. Matches with ground truth depend on Chamfer distances.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,7 +32,7 @@ _LONG_PX = 200  # longer side of a mask
 _SHORT_PX = 100  # shorter side of a mask
 _LINE_PX = 3  # width of a line
 _SMALL_PX = 20  # masks with fewer pixels are dilated
-_SIMPLIFY_M = 0.2  # tolerance of the simplification of ground truth
+_SIMPLIFY_M = 0.2  # tolerance of the simplification of ground truth, in metres
 
 
 @dataclass(frozen=True)
@@ -40,16 +42,18 @@ class ConsistencyConfig:
     Args:
         classes: Names of the classes; a label is an index into them.
         grid: Extent of the map in metres.
-        filled_classes: Labels of the classes that are drawn as areas to create tracks.
+        filled_classes: Labels of the classes that are drawn as areas, not as lines, in the masks
+            for tracks.
         thresholds: Largest Chamfer distances of a match, in metres.
         min_score: Score that predictions must exceed, in [0, 1].
         look_back: Number of earlier frames from which a predicted track may continue, >= 1.
-        min_iou: IoU that neighbouring predictions of a track must exceed.
-        min_truth_iou: IoU that neighbouring ground truths of a track must exceed. Tracks of ground
+        min_iou: IoU that successive predictions of a track must exceed.
+        min_truth_iou: IoU that successive ground truths of a track must exceed. Tracks of ground
             truth continue from the previous frame only.
 
     Raises:
-        ValueError: If a value is out of its range.
+        ValueError: If there is no class or no threshold, a threshold is not a finite number > 0, or
+            ``look_back`` is less than 1.
     """
 
     classes: tuple[str, ...]
@@ -64,6 +68,7 @@ class ConsistencyConfig:
     def __post_init__(self) -> None:
         if not self.classes:
             raise InputError("classes must not be empty.")
+        # The thresholds in ascending order. The class is frozen, so they are not simply assigned.
         object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
         if self.look_back < 1:
             raise InputError(f"look_back must be >= 1, got {self.look_back}.")
@@ -77,11 +82,12 @@ class DriveFrame:
         token: Name of the frame.
         scene: Name of the scene.
         pose: Transform from the annotation frame to the world, in metres. (4, 4)
-        predictions: N predicted elements, in metres in the annotation frame.
+        predictions: N predicted elements with scores, in metres in the annotation frame.
         truth: Annotated elements, in metres in the annotation frame.
         track_ids: Number of the track of each prediction within scene and class, -1 for a
             prediction without a track. None means that tracks are to be created. (N,)
-        lines: Lines to track, in metres in the annotation frame (`with_lines`). (n, 20, 2)
+        lines: Lines to track, in metres in the annotation frame. They are predictions or ground
+            truth, and are empty until `with_lines` sets them. (n, 20, 2)
         labels: Class index of each line to track. (n,)
     """
 
@@ -96,7 +102,7 @@ class DriveFrame:
 
 
 def _resample(elements: MapElements, num_points: int) -> FloatArray:
-    """Resample all lines at equal arc length in the plane. (N, P, 2)"""
+    """Resample the lines of all elements at equal distances in the plane. (N, P, 2)"""
     points = elements.points[:, :2].astype(np.float64)
     return resample_all(points, elements.offsets, num_points=num_points)
 
@@ -104,7 +110,8 @@ def _resample(elements: MapElements, num_points: int) -> FloatArray:
 def draw_line(line: FloatArray, filled: bool, grid: BEVGrid) -> BoolArray:
     """Draw a line to a mask, as MapTracker does to create tracks.
 
-    Lines are 3 pixels wide. A mask of fewer than 20 pixels is dilated.
+    Lines are 3 pixels wide. A mask of fewer than 20 pixels is dilated, so that small elements can
+    overlap as well. Points outside of the map are moved to its edge.
 
     Args:
         line: Vertices in metres. (P, 2)
@@ -112,7 +119,7 @@ def draw_line(line: FloatArray, filled: bool, grid: BEVGrid) -> BoolArray:
         grid: Extent of the map in metres; its longer side has 200 pixels, the other 100.
 
     Returns:
-        Mask. (h, w)
+        Mask, with h rows along y and w columns along x. (h, w)
     """
     x_m, y_m = grid.extent_m
     width = _LONG_PX if x_m >= y_m else _SHORT_PX
@@ -125,8 +132,8 @@ def draw_line(line: FloatArray, filled: bool, grid: BEVGrid) -> BoolArray:
     else:
         cv2.polylines(mask, [pixels], isClosed=False, color=(1,), thickness=_LINE_PX)
     if mask.sum() < _SMALL_PX:
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, ksize=(7, 7))
-        return cv2.dilate(mask, kernel).astype(bool)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, ksize=(7, 7))
+        return cv2.dilate(mask, disc).astype(bool)
     return mask.astype(bool)
 
 
@@ -150,7 +157,8 @@ def overlaps(
     before_masks = _draw_lines(before, filled=filled, grid=grid)
     intersections = now_masks.astype(np.float64) @ before_masks.T
     area_sums = now_masks.sum(axis=1)[:, None] + before_masks.sum(axis=1)
-    return intersections / np.maximum(area_sums - intersections, 1)
+    unions = area_sums - intersections
+    return intersections / np.maximum(unions, 1)  # in pixels; 1 avoids a division by 0
 
 
 def _draw_lines(lines: Sequence[FloatArray], filled: bool, grid: BEVGrid) -> BoolArray:
@@ -176,11 +184,12 @@ def partners(
 ) -> dict[int, int]:
     """Assign the lines of a frame to the lines of an earlier frame by the IoU of their masks.
 
-    The assignment has the largest sum of IoUs. Pairs with a low IoU are left out.
+    Each line has at most one partner. The assignment has the largest sum of IoUs. Pairs with a low
+    IoU are left out afterwards.
 
     Args:
-        now: Current frame.
-        then: Earlier frame.
+        now: Current frame, with ``lines`` and ``labels``.
+        then: Earlier frame, with ``lines`` and ``labels``.
         label: Label of the class.
         config: Rules of the tracks.
         min_iou: IoU that a pair must exceed.
@@ -202,7 +211,7 @@ def partners(
     now_indices, then_indices = linear_sum_assignment(-ious)
     for i, j in zip(now_indices, then_indices, strict=True):
         if ious[i, j] > min_iou:
-            pairs[int(rows[i])] = int(columns[j])
+            pairs[int(rows[i])] = int(columns[j])  # from indices in the class to those in the frame
     return pairs
 
 
@@ -213,13 +222,14 @@ def make_tracks(
 
     A line continues the track of its partner, the line of an earlier frame that it is assigned to
     (`partners`), unless another line of its class in the current frame already has this track.
-    Nearer frames come first. A line that continues no track begins a new one.
+    The previous frame comes first, then frames further back. A line that continues no track begins
+    a new one.
 
     Args:
         frames: Frames of the scene in the order of their times, with ``lines`` and ``labels``.
         config: Rules of the tracks.
         look_back: Number of earlier frames from which a track may continue.
-        min_iou: IoU that neighbouring lines of a track must exceed.
+        min_iou: IoU that successive lines of a track must exceed.
 
     Returns:
         Track of each line of each frame; numbers are unique in the scene. (n,) each
@@ -230,16 +240,16 @@ def make_tracks(
         frame_tracks = np.full(len(frame.lines), fill_value=-1)
         first = max(0, index - look_back)
         for label in range(len(config.classes)):
-            used: set[int] = set()
+            used_tracks: set[int] = set()  # tracks that a line of the class already continues
             for earlier in range(index - 1, first - 1, -1):
                 pairs = partners(
                     frame, frames[earlier], label=label, config=config, min_iou=min_iou
                 )
                 for row, column in pairs.items():
                     track = int(tracks[earlier][column])
-                    if frame_tracks[row] < 0 and track not in used:
+                    if frame_tracks[row] < 0 and track not in used_tracks:
                         frame_tracks[row] = track
-                        used.add(track)
+                        used_tracks.add(track)
         missing = np.flatnonzero(frame_tracks < 0)
         frame_tracks[missing] = np.arange(num_tracks, num_tracks + len(missing))
         num_tracks += len(missing)
@@ -248,7 +258,12 @@ def make_tracks(
 
 
 def with_lines(frame: DriveFrame, elements: MapElements) -> DriveFrame:
-    """Return a copy of a frame whose ``lines`` to track are the lines of ``elements``."""
+    """Return a copy of a frame whose ``lines`` to track are the lines of ``elements``.
+
+    Args:
+        frame: Frame of a drive.
+        elements: Predictions or ground truth of the frame.
+    """
     lines = _resample(elements, num_points=TRACK_POINTS)
     return replace(frame, lines=lines, labels=np.asarray(elements.labels))
 
@@ -257,7 +272,7 @@ def track_drive(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list
     """Create the tracks of the predictions of one scene.
 
     Args:
-        frames: Frames of the scene.
+        frames: Frames of the scene in the order of their times.
         config: Rules of the tracks.
 
     Returns:
@@ -282,7 +297,7 @@ def tracks_of(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list[I
     """Return the tracks of the predictions of one scene; create them where ``track_ids`` is None.
 
     Args:
-        frames: Frames of the scene.
+        frames: Frames of the scene in the order of their times.
         config: Rules of the tracks.
 
     Returns:
@@ -299,7 +314,10 @@ def _chamfer_lines(elements: MapElements, simplify: bool) -> kernels.Lines:
     """Convert elements to lines of 200 points for the Chamfer distance.
 
     With ``simplify``, lines are simplified and resampled to 20 points first, as MapTracker does
-    with ground truth.
+    with ground truth. The height of the points is 0, so that distances are measured in the plane.
+
+    Returns:
+        The format of `kernels.Lines`: points (3, M), offsets (N + 1,) and labels (N,).
     """
     lines = [line[:, :2] for line in elements.polylines]
     if simplify:
@@ -321,8 +339,8 @@ class FrameHits:
     """Predictions of one class in a frame, best first, each with its nearest ground truth.
 
     Args:
-        scores: Score of each prediction. (N,)
-        tracks: Track of each prediction. (N,)
+        scores: Score of each prediction, in descending order. (N,)
+        tracks: Track of each prediction; a number below -1 for a prediction without a track. (N,)
         nearest: Track of the ground truth nearest to each prediction. (N,)
         rows: Index of this ground truth in the frame. (N,)
         distances: Chamfer distance to this ground truth in metres. (N,)
@@ -336,6 +354,9 @@ class FrameHits:
 
     def hits(self, threshold: float, owners: dict[int, int] | None) -> BoolArray:
         """Decide which predictions match their nearest ground truth.
+
+        Of several predictions within the threshold of one ground truth, only the one with the
+        highest score can match, even if it does not continue the track.
 
         Args:
             threshold: Largest Chamfer distance of a match, in metres.
@@ -357,6 +378,7 @@ class FrameHits:
                 is_hit[index] = True
             else:
                 track = int(self.tracks[index])
+                # `setdefault` makes the track the owner if the ground truth has none yet.
                 owner = owners.setdefault(int(self.nearest[index]), track)
                 is_hit[index] = owner == track
         return is_hit
@@ -368,12 +390,13 @@ def _number_untracked(tracks: Sequence[IntArray]) -> list[IntArray]:
     Because the numbers differ, an untracked prediction cannot continue the track of another one.
     """
     numbered = []
-    last = -1
+    last_number = -1  # numbers fall from here on
     for frame_tracks in tracks:
         is_untracked = frame_tracks < 0
-        numbers = last - is_untracked.cumsum()  # last - 1, last - 2, ... if untracked
+        # last_number - 1, last_number - 2, ... at the untracked predictions
+        numbers = last_number - is_untracked.cumsum()
         numbered.append(np.where(is_untracked, numbers, frame_tracks))
-        last -= int(is_untracked.sum())
+        last_number -= int(is_untracked.sum())
     return numbered
 
 
@@ -383,7 +406,7 @@ def score_scene(
     """Compare the predictions of one scene with its ground truth.
 
     Args:
-        frames: Frames of the scene.
+        frames: Frames of the scene in the order of their times.
         config: Rules of the metric.
 
     Returns:
@@ -400,6 +423,7 @@ def score_scene(
     for frame, gt_tracks, tracks in zip(frames, truth_tracks, pred_tracks, strict=True):
         gt_lines = _chamfer_lines(frame.truth, simplify=True)
         pred_lines = _chamfer_lines(frame.predictions, simplify=False)
+        # Distances of different classes are infinite. There is one more column than ground truths.
         distances = kernels.pair_distances(pred_lines, gt=gt_lines, max_distance=np.inf)
         scores = frame.predictions.confidence
         for label in range(len(config.classes)):
@@ -407,19 +431,19 @@ def score_scene(
             if not len(gts):
                 continue
             num_gts[label] += len(gts)
-            is_class = frame.predictions.labels == label
-            preds = np.flatnonzero(is_class & (scores > config.min_score))
+            is_of_class = frame.predictions.labels == label
+            preds = np.flatnonzero(is_of_class & (scores > config.min_score))
             preds = preds[np.argsort(-scores[preds], kind="stable")]
             class_distances = distances[preds][:, gts]  # (predictions, ground truths)
-            nearest = gts[class_distances.argmin(axis=1)]
-            hits = FrameHits(
+            nearest_gts = gts[class_distances.argmin(axis=1)]
+            frame_hits = FrameHits(
                 scores=scores[preds],
                 tracks=tracks[preds],
-                nearest=gt_tracks[nearest],
-                rows=nearest,
-                distances=distances[preds, nearest],
+                nearest=gt_tracks[nearest_gts],
+                rows=nearest_gts,
+                distances=distances[preds, nearest_gts],
             )
-            class_frames[label].append(hits)
+            class_frames[label].append(frame_hits)
     return class_frames, num_gts
 
 
@@ -430,12 +454,13 @@ def jitter(frames: Sequence[DriveFrame], tracks: Sequence[IntArray], grid: BEVGr
     current map range to the nearest points of the current line.
 
     Args:
-        frames: Frames of one scene.
+        frames: Frames of one scene in the order of their times.
         tracks: Track of each prediction of each frame, or -1. (N,) each
         grid: Extent of the map in metres.
 
     Returns:
-        Mean distance in metres of each pair of consecutive lines of a track. (pairs,)
+        Mean distance in metres of each pair of lines of a track in consecutive frames. Pairs whose
+        earlier line lies outside the current map range are left out. (pairs,)
     """
     distances_m = []
     for index in range(1, len(frames)):
@@ -448,8 +473,9 @@ def jitter(frames: Sequence[DriveFrame], tracks: Sequence[IntArray], grid: BEVGr
         for row, track in enumerate(tracks[index]):
             if track < 0:
                 continue
-            is_class = then.predictions.labels == now.predictions.labels[row]
-            for earlier in np.flatnonzero(is_class & (tracks[index - 1] == track)):
+            # Tracks are numbered within a class, so the class must be equal as well.
+            is_of_class = then.predictions.labels == now.predictions.labels[row]
+            for earlier in np.flatnonzero(is_of_class & (tracks[index - 1] == track)):
                 norm = grid.norm_from_metres(earlier_lines[earlier])
                 is_inside = ((norm >= 0) & (norm <= 1)).all(axis=1)
                 points = earlier_lines[earlier][is_inside]
@@ -468,19 +494,21 @@ def group_by_scene(frames: Iterable[DriveFrame]) -> list[list[DriveFrame]]:
 
 
 def consistency(frames: Iterable[DriveFrame], config: ConsistencyConfig) -> dict[str, float]:
-    """Compute C-mAP, an mAP by the same rules but without tracks, and jitter.
+    """Compute C-mAP, an mAP by equal rules that ignores tracks, and jitter.
 
     Args:
         frames: Frames of all scenes; the frames of a scene are in the order of their times.
         config: Rules of the metric.
 
     Returns:
-        Figures by ``consistency/CAP@0.5/<class>``, ``consistency/AP@0.5/<class>``,
-        ``consistency/C-mAP``, ``consistency/mAP`` and ``consistency/jitter_m`` (-1 without tracks).
+        Figures by ``consistency/CAP@0.5/<class>`` and ``consistency/AP@0.5/<class>`` for each
+        threshold and class, ``consistency/C-mAP``, ``consistency/mAP`` and
+        ``consistency/jitter_m``. APs are in [0, 1]. The jitter is in metres, or -1 if no track has
+        lines in two consecutive frames.
     """
     scenes = group_by_scene(frames)
-    scene_hits = []
-    scene_counts = []
+    scene_hits = []  # for each scene and class, the list of `FrameHits`
+    scene_counts = []  # number of ground truths of each class in each scene
     for scene in scenes:
         class_frames, num_gts = score_scene(scene, config)
         scene_hits.append(class_frames)
@@ -502,7 +530,7 @@ def consistency(frames: Iterable[DriveFrame], config: ConsistencyConfig) -> dict
                 aps.append(ap)
     figures["consistency/C-mAP"] = float(np.mean(all_aps["CAP"]))
     figures["consistency/mAP"] = float(np.mean(all_aps["AP"]))
-    jitters = [np.empty(0)]
+    jitters = [np.empty(0)]  # an array to concatenate even if there is no scene
     for scene in scenes:
         jitters.append(jitter(scene, tracks_of(scene, config), grid=config.grid))
     jitter_m = np.concatenate(jitters)
@@ -516,7 +544,7 @@ def _average_precision(
     """Compute the AP of one class over all scenes.
 
     Args:
-        scenes: Frames of each scene with ground truth of the class.
+        scenes: `FrameHits` of the class in each frame of each scene, in the order of their times.
         num_gts: Number of ground truths of the class.
         threshold: Largest Chamfer distance of a match, in metres.
         consistent: Whether matches must continue the tracks of earlier frames.
@@ -524,6 +552,7 @@ def _average_precision(
     hits = [np.empty(0, dtype=bool)]
     scores = [np.empty(0)]
     for scene in scenes:
+        # Owners of the tracks of ground truth in this scene (`FrameHits.hits`).
         owners: dict[int, int] | None = {} if consistent else None
         for frame in scene:
             hits.append(frame.hits(threshold, owners))

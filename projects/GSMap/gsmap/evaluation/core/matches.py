@@ -7,11 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-import gsmap.utils.compilation  # noqa: F401 - reports that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - logs a notice while numba compiles `assign`
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.utils.errors import InputError
 
-_COLUMNS = {  # type codes (Python's `array`) of the columns of a table
+# Columns of a `MatchTable` and their type codes of Python's `array` ("q" int64, "d" float64, "b"
+# int8). Each column is flat, with the values of all samples one after another. "length" has one
+# value per sample, its number of predictions. The last two columns have C values per sample. "hits"
+# has T values per prediction, and the other columns have one.
+_COLUMNS = {
     "length": "q",
     "labels": "q",
     "scores": "d",
@@ -56,7 +60,7 @@ class FrameMatches:
     def empty_if_one_sided(self) -> "FrameMatches":
         """Return the matches of an empty sample if there are no predictions or no ground truths.
 
-        Otherwise, return these matches.
+        Otherwise, return these matches. VectorMapNet's metric ignores such samples.
         """
         if len(self.labels) and self.num_gts.any():
             return self
@@ -98,7 +102,11 @@ class ClassDetections:
     gts_of_sample: IntArray
 
     def at(self, thresholds: Sequence[float]) -> "ClassDetections":
-        """Return the detections at some of the thresholds."""
+        """Return the detections at some of the thresholds.
+
+        Raises:
+            ValueError: If a threshold is not one of ``self.thresholds``.
+        """
         columns = [list(self.thresholds).index(threshold) for threshold in thresholds]
         return replace(self, thresholds=tuple(thresholds), hits=self.hits[:, columns])
 
@@ -170,7 +178,7 @@ def ranked_predictions(
     places = []  # indices into `rows`, which are in descending order of score
     for label in range(num_classes):
         places_of_class = np.flatnonzero(labels == label)
-        places.append(places_of_class[:max_num])
+        places.append(places_of_class[:max_num])  # all of them if `max_num` is None
     return rows[np.sort(np.concatenate(places))]
 
 
@@ -187,7 +195,8 @@ class MatchTable:
     """
 
     def __init__(self, matches: Iterable[FrameMatches] = ()) -> None:
-        self._index_of: dict[str, int] = {}  # by token
+        # Index of each sample by its token, in the order in which the samples were added.
+        self._index_of: dict[str, int] = {}
         self._columns = {name: array(code) for name, code in _COLUMNS.items()}
         for record in matches:
             self.add(record)
@@ -202,7 +211,7 @@ class MatchTable:
         self._index_of[record.token] = len(self)
         values = vars(record) | {"length": len(record.labels), "hits": record.matched_gt >= 0}
         for name, column in self._columns.items():
-            if values[name] is not None:
+            if values[name] is not None:  # `class_iou` may be None
                 cells = np.asarray(values[name], dtype=column.typecode)
                 column.frombytes(cells.tobytes())
 
@@ -217,7 +226,10 @@ class MatchTable:
         return np.array([self._index_of[token] for token in self.tokens], dtype=np.int64)
 
     def class_iou(self, label: int) -> FloatArray:
-        """Return ``FrameMatches.class_iou`` of one class in all samples. (S,)"""
+        """Return ``FrameMatches.class_iou`` of one class in all samples. (S,)
+
+        The order is the order of `tokens`. The result is empty if the metric has no such IoU.
+        """
         values = np.asarray(self._columns["class_iou"]).reshape(len(self), -1)
         return values[self._order, label] if values.size else np.zeros(0)
 
@@ -231,7 +243,7 @@ class MatchTable:
             Detections of each class by its name.
         """
         columns = {name: np.asarray(column) for name, column in self._columns.items()}
-        num_thresholds = len(next(iter(thresholds.values())))
+        num_thresholds = len(next(iter(thresholds.values())))  # equal in all classes
         order = self._order
 
         # Row in the columns of each prediction, with the samples in the order of their tokens. The
@@ -254,10 +266,11 @@ class MatchTable:
         for label, (name, class_thresholds) in enumerate(thresholds.items()):
             places = np.flatnonzero(labels == label)
             samples_of_class = samples[places]  # ascending
-            # The rank of a prediction is counted from the first prediction of its sample.
+            # The predictions of a sample are in descending order of score. So the rank of a
+            # prediction is its distance from the first prediction of its sample.
             first_of_sample = np.searchsorted(samples_of_class, samples_of_class)
             ranks = np.arange(len(places)) - first_of_sample
-            by_score = np.argsort(-scores[places], kind="stable")
+            by_score = np.argsort(-scores[places], kind="stable")  # equal scores keep their order
             places = places[by_score]
             rows = rows_by_token[places]
             detections[name] = ClassDetections(
@@ -280,12 +293,13 @@ def assign(quality: FloatArray, thresholds: FloatArray) -> IntArray:
     Among equally good ground truths, the last one is taken.
 
     Args:
-        quality: IoU or negative distance of each pair, so that larger values are better. The
-            predictions are in descending order of score. (N, K)
-        thresholds: Smallest quality of a match, inclusive, for each prediction. (N, T)
+        quality: IoU or negative distance of each pair, so that larger values are better (unlike
+            ``FrameMatches.quality``). The predictions are in descending order of score. (N, K)
+        thresholds: Smallest quality of a match, inclusive, for each prediction, in the unit of
+            ``quality``. (N, T)
 
     Returns:
-        Index of the matched ground truth, or -1. (N, T)
+        Index of the matched ground truth, or -1 without a match. (N, T)
     """
     matched_gt = np.full(thresholds.shape, -1)
     for t in range(thresholds.shape[1]):

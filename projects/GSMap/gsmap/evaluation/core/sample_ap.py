@@ -3,7 +3,8 @@
 The rules equal the public evaluation code of the methods that use this metric:
 
 - The lines of a class in a sample are drawn to one mask with pixels of 0.15 m, in the order of the
-  file. A later line hides the pixels of earlier lines that it crosses.
+  file. A pixel has the number of its line. A later line hides the pixels of earlier lines that it
+  crosses.
 - The directed distance from one line to another is the mean distance from the pixels of the first
   line to the nearest pixel of the second one. The distance of two lines is the mean of both
   directed distances.
@@ -37,7 +38,8 @@ from gsmap.utils.errors import InputError
 
 PIXEL_M = 0.15
 _FAR_PX = 2.0**20  # coordinates are clipped to this limit, as OpenCV draws with integers
-_NO_PIXEL = 1e6  # distance in a column without pixels of the line, larger than any canvas
+# Distance in pixels in a column without pixels of the line. It is larger than any canvas.
+_NO_PIXEL = 1e6
 MaskArray = npt.NDArray[np.int32]
 GapArray = npt.NDArray[np.float32]  # distances within the columns of a mask, in pixels
 
@@ -47,19 +49,20 @@ class SampleAP(Metric):
     """Base class of AP per sample. Each method has a subclass in ``models/<method>/metric.py``.
 
     Attributes:
-        ranks: Whether the metric ranks predictions over all samples.
+        ranks: Whether the metric ranks predictions over all samples. It is true, although AP is
+            computed per sample: reports have the ranked ``detections`` of each class.
         takes_min_score: Whether the metric uses the setting ``min_score``.
         line_px: Thickness of lines in pixels.
         report_thresholds: Largest distances of a match in metres, by the name of the report.
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        grid: Extent of the canvas in metres; its raster is not used.
+        grid: Extent of the canvas, the area of the masks, in metres; its raster is not used.
         min_score: Smallest score of a prediction that counts, in [0, 1]. With the default, all
             predictions count, as in the public code of the methods.
 
     Raises:
-        ValueError: If a value is out of its range.
+        ValueError: If ``classes`` has no names, or ``min_score`` is not in [0, 1].
     """
 
     ranks: ClassVar[bool] = True
@@ -78,8 +81,12 @@ class SampleAP(Metric):
 
     @classmethod
     def from_settings(cls, settings: MetricSettings) -> "SampleAP":
-        """Create the metric from the settings of a command or config."""
-        min_score = settings.min_score or 0.0
+        """Create the metric from the settings of a command or config.
+
+        Raises:
+            ValueError: If the settings have no extent of the map.
+        """
+        min_score = settings.min_score or 0.0  # None stands for the default
         return cls(classes=settings.classes, grid=settings.canvas, min_score=min_score)
 
     @property
@@ -104,6 +111,7 @@ class SampleAP(Metric):
     def size_px(self) -> tuple[int, int]:
         """Columns (along x) and rows (along y) of the canvas."""
         x_m, y_m = self.grid.extent_m
+        # 1e-6 is subtracted so that a rounding error does not add a column or a row.
         columns = int(np.ceil(x_m / PIXEL_M - 1e-6))
         rows = int(np.ceil(y_m / PIXEL_M - 1e-6))
         return columns, rows
@@ -117,12 +125,12 @@ def draw_numbers(elements: MapElements, label: int, config: SampleAP) -> MaskArr
     Args:
         elements: Elements in metres; elements of fewer than two points are not drawn.
         label: Label of the class.
-        config: Rules of the metric.
+        config: Rules of the metric: extent of the canvas and thickness of lines.
 
     Returns:
         Index of the element at each pixel, or -1. (H, W)
     """
-    import cv2  # AP_chamfer and AP_raster do not need it
+    import cv2  # imported here, because AP_chamfer and AP_raster do not need it
 
     columns, rows = config.size_px
     mask = np.zeros((rows, columns), dtype=np.int32)
@@ -144,10 +152,10 @@ class _MaskPixels:
 
     Args:
         mask: Number of the element at each pixel, or -1. (H, W)
-        indices: Index in the sample of each numbered element. (n,)
+        indices: Index of each numbered element in the input of `draw_numbers`. (n,)
         rows: Row of each pixel. (M,)
         columns: Column of each pixel. (M,)
-        owners: Number of the element of each pixel, ascending. (M,)
+        owners: Number of the element of each pixel. The M pixels are sorted by it. (M,)
     """
 
     mask: MaskArray
@@ -178,12 +186,19 @@ class _MaskPixels:
         return len(self.indices)
 
     def bounds(self, coordinates: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the smallest and the largest row, or column, of each element. (n,) each"""
-        values = coordinates.astype(np.float64)
+        """Return the smallest and the largest row, or column, of each element. (n,) each
+
+        Args:
+            coordinates: ``rows`` or ``columns``. (M,)
+        """
+        coordinates_px = coordinates.astype(np.float64)
         if not self.count:
-            return values, values
+            return coordinates_px, coordinates_px  # both are empty
+        # The pixels are sorted by element. `starts` is the index of each element's first pixel.
         starts = np.searchsorted(self.owners, np.arange(self.count))
-        return np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        smallest = np.minimum.reduceat(coordinates_px, starts)
+        largest = np.maximum.reduceat(coordinates_px, starts)
+        return smallest, largest
 
 
 @njit(cache=True)
@@ -196,7 +211,8 @@ def _fill_gaps(gaps: GapArray, mask: MaskArray, number: int) -> None:
         number: Number of the element.
     """
     height, width = mask.shape
-    gaps[0] = _NO_PIXEL  # read in the loop by the first row, which has no row above
+    # Row 0 has no row above. In the loop, it reads these distances in place of a row above.
+    gaps[0] = _NO_PIXEL
     for r in range(height):  # distance from the nearest pixel above
         above = gaps[max(r - 1, 0)]
         for c in range(width):
@@ -213,10 +229,14 @@ def _distance_from_gaps(gaps: GapArray, column: int) -> float:
     Args:
         gaps: Distances from `_fill_gaps` in the row of the pixel. (W,)
         column: Column of the pixel.
+
+    Returns:
+        Distance in pixels.
     """
+    # Squared distance to the nearest pixel of the element in the columns searched so far.
     best_sq = gaps[column] ** 2
-    # Pixels that are `step` columns away have at least the distance `step`, so the search ends when
-    # `step` reaches the smallest distance so far.
+    # The columns on both sides are searched. Pixels that are `step` columns away have at least the
+    # distance `step`, so the search ends when `step` reaches the smallest distance so far.
     step = 1
     while step * step < best_sq and step < len(gaps):
         if column >= step:
@@ -260,7 +280,16 @@ def _mean_distances(
 
 
 def _squared_gaps(first: _MaskPixels, second: _MaskPixels, axis: str) -> FloatArray:
-    """Compute squared gaps in pixels between the bounds of elements along an axis. (n, k)"""
+    """Compute squared gaps in pixels between the bounds of elements along an axis.
+
+    Args:
+        first: Pixels of n elements.
+        second: Pixels of k elements.
+        axis: ``rows`` or ``columns``, the coordinates that are compared.
+
+    Returns:
+        Squared gaps, 0 where the bounds overlap. (n, k)
+    """
     first_low, first_high = first.bounds(getattr(first, axis))
     second_low, second_high = second.bounds(getattr(second, axis))
     gaps = np.maximum(second_low - first_high[:, None], first_low[:, None] - second_high)
@@ -276,7 +305,8 @@ def line_distances(
     Args:
         pred_mask: Index of the prediction at each pixel, or -1. (H, W)
         gt_mask: Index of the ground truth at each pixel, or -1. (H, W)
-        limit_m: Limit in metres. Pairs that cannot be closer than this are not measured.
+        limit_m: Limit in metres. Pairs that cannot be closer than this are not measured, which
+            saves time.
 
     Returns:
         Distances in metres, infinite where they are not measured (n, k); indices of the predictions
@@ -284,6 +314,7 @@ def line_distances(
     """
     pred = _MaskPixels.from_mask(pred_mask)
     gt = _MaskPixels.from_mask(gt_mask)
+    # The distance of the bounding boxes is at most the distance of the lines.
     box_distances = np.sqrt(
         _squared_gaps(gt, pred, axis="rows") + _squared_gaps(gt, pred, axis="columns")
     )  # (k, n)
@@ -291,7 +322,8 @@ def line_distances(
     from_pred = _mean_distances(
         gt.mask, is_near=is_near, rows=pred.rows, columns=pred.columns, owners=pred.owners
     ).T  # (n, k)
-    # The distance is the mean of both directions, so it is at least half of one direction.
+    # The distance is the mean of both directions, so it is at least half of one direction. This
+    # also leaves out the pairs whose `from_pred` is infinite.
     is_near = from_pred * PIXEL_M / 2 < limit_m
     from_gt = _mean_distances(
         pred.mask, is_near=is_near, rows=gt.rows, columns=gt.columns, owners=gt.owners
@@ -309,11 +341,11 @@ def closest_pairs(distance_m: FloatArray, limit_m: float) -> IntArray:
     Returns:
         Column of each row, or -1. (n,)
     """
-    remaining = distance_m.copy()
+    remaining = distance_m.copy()  # matched rows and columns become infinite
     partners = np.full(len(distance_m), fill_value=-1)
     while remaining.size:
         row, column = np.unravel_index(remaining.argmin(), remaining.shape)
-        if not remaining[row, column] < limit_m:
+        if not remaining[row, column] < limit_m:  # the closest pair is too far apart
             break
         partners[row] = column
         remaining[row] = np.inf
@@ -329,19 +361,23 @@ def match_sample_ap(
     Predictions and ground truths without a visible pixel do not count.
 
     Args:
-        predictions: Elements with scores.
-        ground_truth: Annotated elements at full resolution.
+        predictions: Elements with scores, in metres.
+        ground_truth: Annotated elements at full resolution, in metres.
         config: Rules of the metric.
         token: Name of the sample.
 
+    Returns:
+        Visible predictions in descending order of score, with their matches at each of the T
+        thresholds and the distances of their matches in metres, NaN without a match.
+
     Raises:
-        ValueError: As for `check_pair`.
+        ValueError: If a label is below -1 or beyond the classes, or predictions have no scores.
     """
     check_pair(predictions, ground_truth, classes=config.classes, token=token)
     thresholds = np.array(config.thresholds)
-    limit_m = thresholds[-1]
-    partners = np.full(len(predictions), fill_value=-1)
-    quality = np.full(len(predictions), fill_value=np.nan)
+    limit_m = thresholds[-1]  # the largest one
+    partners = np.full(len(predictions), fill_value=-1)  # ground truth of each prediction
+    quality = np.full(len(predictions), fill_value=np.nan)  # distance of each match in metres
     is_visible = np.zeros(len(predictions), dtype=np.bool_)
     num_gts = np.zeros(len(config.classes), dtype=np.int64)
     confident = np.flatnonzero(predictions.confidence >= config.min_score)
@@ -359,7 +395,7 @@ def match_sample_ap(
         quality[preds[is_match]] = distance[is_match, matched[is_match]]
     visible = np.flatnonzero(is_visible)
     ranked = visible[np.argsort(-predictions.confidence[visible], kind="stable")]
-    within = quality[ranked, None] < thresholds  # (n, T)
+    within = quality[ranked, None] < thresholds  # False for NaN, without a match. (n, T)
     return FrameMatches(
         token=token,
         pred_index=ranked,
@@ -378,7 +414,8 @@ def sample_aps(detections: ClassDetections) -> FloatArray:
     matched predictions come first.
 
     Args:
-        detections: Predictions of the class in all samples.
+        detections: Predictions of the class in all S samples, in descending order of score, with
+            their matches at T thresholds.
 
     Returns:
         AP in [0, 1]; NaN for a sample with neither predictions nor ground truth. (S, T)
@@ -389,7 +426,7 @@ def sample_aps(detections: ClassDetections) -> FloatArray:
     samples = detections.samples
     num_preds = np.bincount(samples, minlength=num_samples)
     aps = np.full((num_samples, len(detections.thresholds)), fill_value=np.nan)
-    aps[num_preds + num_gts > 0] = 0.0
+    aps[num_preds + num_gts > 0] = 0.0  # replaced below in samples with a match
     # After `order` below, the predictions of sample s are entries starts[s] to ends[s] - 1.
     ends = np.cumsum(num_preds)
     starts = ends - num_preds
@@ -403,10 +440,10 @@ def sample_aps(detections: ClassDetections) -> FloatArray:
     return aps
 
 
-def _mean(values: FloatArray) -> float:
-    """Compute the mean of the values that are not NaN; `UNDEFINED` if there are none."""
-    defined = values[~np.isnan(values)]
-    return float(defined.mean()) if len(defined) else UNDEFINED
+def _mean(aps: FloatArray) -> float:
+    """Compute the mean of the APs that are not NaN; `UNDEFINED` (-1) if there are none."""
+    defined_aps = aps[~np.isnan(aps)]
+    return float(defined_aps.mean()) if len(defined_aps) else UNDEFINED
 
 
 def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricReport]:
@@ -418,7 +455,11 @@ def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricRepor
     Args:
         matches: Matches of all samples by the rules of ``config``.
         config: Rules of the metric.
+
+    Returns:
+        One report per entry of ``config.report_thresholds``, in their order.
     """
+    # All classes have the thresholds of all reports. `at` below selects the thresholds of a report.
     all_thresholds = dict.fromkeys(config.classes, config.thresholds)
     all_detections = matches.detections(all_thresholds)
     reports = []
@@ -430,11 +471,12 @@ def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricRepor
         for row, class_name in enumerate(all_detections):
             ranked = all_detections[class_name].at(thresholds)
             class_aps = sample_aps(ranked)
-            class_means = [_mean(values) for values in class_aps.T]
+            class_means = [_mean(column) for column in class_aps.T]  # one column per threshold
+            # Figures such as the AP and the mean distance of the matches at each threshold.
             for key, value in distance_figures(ranked, class_means).items():
                 metrics[f"{class_name}/{key}"] = value
             # Whether the AP of a sample is defined does not depend on the threshold.
-            num_samples = (~np.isnan(class_aps[:, 0])).sum()
+            num_samples = (~np.isnan(class_aps[:, 0])).sum()  # samples with a defined AP
             metrics[f"{class_name}/num_samples"] = float(num_samples)
             # An undefined mean is reported as UNDEFINED. Here it becomes NaN, so that `_mean` below
             # leaves it out.

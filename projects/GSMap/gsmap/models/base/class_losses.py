@@ -14,7 +14,11 @@ from gsmap.structures.tensors import constant
 
 
 class ClassLoss(nn.Module):
-    """Base class of classification losses that depend on matched pairs."""
+    """Base class of classification losses that depend on matched pairs.
+
+    A matched pair is a query and its ground truth. There are M pairs in all L decoder layers
+    together, and N queries in each layer.
+    """
 
     def check(self, head: BuiltHead) -> None:
         """Raise ValueError if a head lacks an input of the loss. Called when the head is built."""
@@ -56,6 +60,7 @@ class DistanceQuality(Quality):
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Quality of each matched pair. (M,)"""
+        # `gt_pts` are in the point order that the matching has chosen. (M, P, 2 or 3)
         distances = (pairs.pred_pts.detach() - pairs.gt_pts).abs().mean(1).sum(-1)
         return (-self.scale * distances).exp()
 
@@ -98,6 +103,7 @@ class QualityClassLoss(ClassLoss):
 
     def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the head lacks a class or an input of the quality."""
+        # Without a selection of classes, there is no index to check.
         check_classes("loss_cls.classes", self.classes or (), head.classes)
         self.quality.check(head)
 
@@ -111,6 +117,7 @@ class QualityClassLoss(ClassLoss):
         targets = self.targets(pairs)
         # The queries of all layers are concatenated, beginning with the first layer.
         num_queries = scores.shape[1] // pairs.num_layers
+        # Class of the ground truth of each query, -1 without a match.
         first_labels = pairs.query_labels()[:, :num_queries]
         first_losses = plain_class_loss(
             self.first_layer, scores=scores[:, :num_queries], labels=first_labels
@@ -131,6 +138,7 @@ class QualityClassLoss(ClassLoss):
         quality = self.quality(pairs).detach().to(targets)
         if self.classes is not None:
             is_selected = [index in self.classes for index in range(scores.shape[-1])]
+            # Table by class index. `constant` uploads it to the device once.
             has_quality = constant(pairs.gt_labels, is_selected, torch.bool)
             quality = torch.where(has_quality[pairs.gt_labels], quality, 1.0)
         targets[pairs.samples, pairs.query_inds, pairs.gt_labels] = quality
@@ -148,8 +156,8 @@ def plain_class_loss(loss: Any, scores: Tensor, labels: Tensor) -> Tensor:
     Returns:
         Weighted loss of every logit. (B, N, classes)
     """
-    # With one-hot targets, mmdet's focal loss does not need its compiled op. Column 0 marks queries
-    # without a class (label -1) and is removed.
+    # With one-hot targets, mmdet's focal loss does not need its compiled op. The shift by 1 gives
+    # queries without a class (label -1) the column 0, which is then removed.
     one_hot = F.one_hot(labels + 1, scores.shape[-1] + 1)[..., 1:]
     values = loss(scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none")
     return values.view_as(scores)

@@ -23,13 +23,14 @@ class GeMapHead(MapHead):
         losses: Configs of the other losses.
         query_groups: Settings of each `QueryGroup`. Without ``one_to_many``, only the first group
             is used.
-        loss_euclidean: Settings of `EuclideanLoss`, which by default has its default values. With
-            None, the head is trained without this loss.
+        loss_euclidean: Settings of `EuclideanLoss`. The default ``DEFAULTS`` is empty and leaves
+            all settings at their default values. None trains the head without this loss.
         decoupled: Whether to use the self-attention of GeMap in the layers instead of the
             configured one.
         one_to_many: Whether to keep the query groups after the first one, which GeMap does not
             have. The Euclidean loss of their many matches takes much memory. To train a group
-            without it, list the other losses in ``losses`` of the group.
+            without this loss, list the names of the other losses in ``losses`` of its
+            `QueryGroup`.
         kwargs: Further arguments of `MapHead`.
     """
 
@@ -44,10 +45,12 @@ class GeMapHead(MapHead):
         **kwargs: Any,
     ) -> None:
         layer = decoder.get("layer", {})
+        # An attention of this class in the config is kept, because it may have other settings.
         attention_class = class_of(layer.get("self_attn", {}))
         if decoupled and attention_class is not GeometryDecoupledAttention:
             layer = {**layer, "self_attn": {"type": GeometryDecoupledAttention}}
             decoder = {**decoder, "layer": layer}
+        # `optional_part` returns a list with one config, or an empty list for None.
         super().__init__(
             decoder=decoder,
             losses=[*losses, *optional_part(EuclideanLoss, loss_euclidean)],

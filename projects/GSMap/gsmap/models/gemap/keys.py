@@ -1,7 +1,11 @@
 """Mapping between the state keys of the released GeMap and of this project.
 
 `rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
-Each word of the text continues both prefixes: ``released=here``, or one name for both.
+Each word of the text continues both prefixes: ``released=here``, or one name for both. In a
+`KeyMap`, the first rule that matches a key is applied. ``unused`` are released keys without a
+counterpart here, with the values that conversion to the release writes. None marks a key that only
+some checkpoints have and that conversion does not write. If all ``markers`` are present, the keys
+are of this model.
 """
 
 import torch
@@ -24,6 +28,7 @@ from gsmap.models.maptrv2.keys import LIFTED_MARKER, LIFTED_RULES, LIFTED_UNUSED
 _GEOMETRY_RULES = rules_of(
     DECODER_LAYER + "attentions.0.", LAYER + "self_attn.", "inter_=inter. intra_=intra."
 )
+# Simple objective: GeMap in MapTR.
 GEMAP = KeyMap(
     "gemap",
     (*_GEOMETRY_RULES, *MAPTR.rules),
@@ -38,6 +43,8 @@ GEMAP = KeyMap(
     markers=_GEOMETRY_RULES[:1],
     ignored_pattern=GRID_OFFSETS,
 )
+# Full objective: GeMap in MapTRv2, with its encoder that lifts image features by depth. The marker
+# of this encoder is an additional condition.
 GEMAP_FULL = KeyMap(
     "gemap-full",
     (*_GEOMETRY_RULES, *LIFTED_RULES, *DECODER_RULES),
@@ -45,4 +52,5 @@ GEMAP_FULL = KeyMap(
     markers=(*_GEOMETRY_RULES[:1], LIFTED_MARKER),
 )
 
+# The map with more markers is first, because keys of the full objective have the marker of both.
 KEY_MAPS = (GEMAP_FULL, GEMAP)

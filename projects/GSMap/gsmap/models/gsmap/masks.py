@@ -20,11 +20,16 @@ class GaussianMasks(ElementMasks):
     Args:
         grid: Extent of the map.
         held_classes: Class indices of elements whose masks pass no gradient to the points, only to
-            sigma and theta.
-        kwargs: Settings of `ElementMasks`. ``source="gaussians"`` is like ``"points"``, but the
-            mask of the ground truth is rendered from Gaussians along its points (GSMap Eq. 6). The
-            integral of this mask across a line is the width of the line. Predictions are rendered
-            from Gaussians as well, so their masks can equal such a mask.
+            the other parameters of the Gaussians: their sizes sigma and angles theta.
+        kwargs: Settings of `ElementMasks`, such as ``line_width_m`` and ``source``, the form of the
+            ground truth in masks. ``"full"`` draws it at full resolution, and ``"points"`` draws
+            its P points, both as bands or filled polygons. ``"gaussians"`` renders its mask from
+            Gaussians along the P points (GSMap Eq. 6). The integral of this mask across a line is
+            the width of the line. Predictions are rendered from Gaussians as well, so their masks
+            can equal such a mask.
+
+    Attributes:
+        sources: Valid values of ``source``.
     """
 
     sources: ClassVar[tuple[str, ...]] = ("full", "points", "gaussians")
@@ -43,7 +48,8 @@ class GaussianMasks(ElementMasks):
 
         Args:
             polylines: Points in metres. (K, M, 2 or 3)
-            labels: Class indices. (K,)
+            labels: Class indices, which select the elements drawn as filled polygons. They have no
+                effect on Gaussians. (K,)
             grid: The raster.
 
         Returns:
@@ -52,7 +58,8 @@ class GaussianMasks(ElementMasks):
         if self.source != "gaussians":
             return super().draw(polylines, labels, grid)
         # The integral of a Gaussian of height 1 is sqrt(2 pi) sigma, here the width of the line.
-        across_m = self.line_width_m / math.sqrt(2 * math.pi)
+        across_m = self.line_width_m / math.sqrt(2 * math.pi)  # sigma across the line
+        # One Gaussian per point, whose longer axis points along the line.
         gaussians = gaussians_along(polylines[..., :2].float(), across_m)
         return render_gaussians(
             gaussians.means, gaussians.scales, rotations=gaussians.rotations, grid=grid
@@ -65,10 +72,14 @@ class GaussianMasks(ElementMasks):
             references: Vertices that the decoder predicts: ``coords`` coordinates, then the other
                 parameters of the Gaussian. (M, P, D)
             labels: Class indices of their ground truths. (M,)
-            coords: Number of coordinates of a point.
+            coords: Number of coordinates of a point, 2 or 3.
+
+        Returns:
+            References with equal values. (M, P, D)
         """
         if not self.held_classes:
             return references
+        # `constant` creates the tensor of the class indices once for each device.
         is_held = torch.isin(labels, constant(labels, self.held_classes))[:, None, None]
         points = references[..., :coords]
         points = torch.where(is_held, points.detach(), points)

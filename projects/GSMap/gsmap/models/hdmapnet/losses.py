@@ -45,18 +45,21 @@ class LineMapLosses:
         """Compute the weighted losses.
 
         Args:
-            maps: Predictions of a batch.
+            maps: Predictions of a batch: logits ``semantic`` of the background and the classes
+                (B, 1 + classes, H, W), instance embeddings ``embedding`` (B, E, H, W), and logits
+                ``direction`` of no direction and of K directions (B, 1 + K, H, W).
             numbers: Instance number of each pixel in each class, 0 for none. No two instances of a
                 sample have the same number, even if their classes differ. (B, classes, H, W)
             directions: Index, 1 to K, of the forward and of the backward direction of the line at
                 each pixel, 0 for no line. (B, 2, H, W)
 
         Returns:
-            ``loss_semantic``, ``loss_pull``, ``loss_push`` and ``loss_direction``.
+            ``loss_semantic``, ``loss_pull``, ``loss_push`` and ``loss_direction``, all scalars. The
+            pull and push losses are means over the samples.
         """
         background = (numbers == 0).all(dim=1, keepdim=True)
         classes = torch.cat([background, numbers > 0], dim=1)  # (B, 1 + classes, H, W)
-        # A scalar on the device of `numbers`
+        # A cached scalar on the device of `numbers`
         weight = constant(numbers, self.pos_weight, torch.float)
         semantic = F.binary_cross_entropy_with_logits(
             maps.semantic, classes.to(maps.semantic), pos_weight=weight
@@ -87,24 +90,29 @@ class LineMapLosses:
             numbers: Instance number of each pixel, 0 for none. (H, W)
 
         Returns:
-            Two unweighted scalars.
+            The pull loss and the push loss, two unweighted scalars.
         """
         is_instance = numbers > 0
         pixels = embedding[:, is_instance].T  # (n, E)
+        # `index` is the instance of each pixel, from 0 without gaps, and `counts` the number of
+        # pixels of each instance.
         _, index, counts = numbers[is_instance].unique(return_inverse=True, return_counts=True)
         if not len(counts):
-            return embedding.sum() * 0, embedding.sum() * 0  # 0 with a gradient of 0
+            # The product is 0, and keeps the loss connected to the network with a gradient of 0.
+            return embedding.sum() * 0, embedding.sum() * 0
         sums = pixels.new_zeros(len(counts), len(embedding)).index_add(0, index, pixels)
         means = sums / counts[:, None]  # (instances, E)
         distance = (pixels - means[index]).norm(dim=1)
-        excess = (distance - self.pull_margin).clamp(min=0) ** 2
-        pull = (excess / counts[index]).sum() / len(counts)
-        if len(counts) == 1:
+        squared_excess = (distance - self.pull_margin).clamp(min=0) ** 2
+        # The mean over the pixels of each instance, then over the instances.
+        pull = (squared_excess / counts[index]).sum() / len(counts)
+        if len(counts) == 1:  # no pair to push apart
             return pull, means.sum() * 0
+        # The indices of all pairs of different instances, each pair once.
         first, second = torch.triu_indices(len(counts), len(counts), offset=1, device=means.device)
         separation = (means[first] - means[second]).norm(dim=1)
-        overlap = (self.push_margin - separation).clamp(min=0) ** 2
-        return pull, overlap.mean() / 2
+        squared_overlap = (self.push_margin - separation).clamp(min=0) ** 2
+        return pull, squared_overlap.mean() / 2
 
 
 def direction_loss(logits: Tensor, directions: Tensor) -> Tensor:
@@ -122,8 +130,9 @@ def direction_loss(logits: Tensor, directions: Tensor) -> Tensor:
     # lines, both indices are 0, which gives channel 0 ("no direction") a target of 2 * 1/2 = 1.
     counts = F.one_hot(directions, num_classes).sum(dim=1).movedim(-1, 1)  # (B, 1 + K, H, W)
     target = counts.to(logits) / 2
-    is_line = 1 - target[:, :1]
+    is_line = 1 - target[:, :1]  # 1 on lines, 0 beside them. (B, 1, H, W)
     # As in the released code of HDMapNet, the softmax over the channels is followed by a binary
     # cross-entropy of each channel.
     loss = F.binary_cross_entropy(logits.softmax(dim=1), target, reduction="none")
+    # The mean over the channels of all pixels of lines; 0 without lines.
     return (loss * is_line).sum() / (is_line.sum() * num_classes).clamp(min=1)

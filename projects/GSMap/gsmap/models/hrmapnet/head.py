@@ -18,7 +18,8 @@ from gsmap.models.base.queries import PointTable
 class ContentDecoder(MapDecoder):
     """`MapDecoder` whose layers get no positional queries, as in HRMapNet.
 
-    It has the arguments of `MapDecoder`.
+    The layers add positional queries to the content. Here they are zero. The constructor has the
+    arguments of `MapDecoder`.
     """
 
     def forward(
@@ -35,15 +36,17 @@ class ContentDecoder(MapDecoder):
 
         Args:
             query: Content of the queries. (B, Q, C)
-            query_pos: Positional queries; not used. (B, Q, C)
-            reference: Initial references. (B, N * P, D)
+            query_pos: Positional queries; only their shape is used. (B, Q, C)
+            reference: Initial references, D entries for each point. (B, N * P, D)
             bev_feats: BEV features. (B, C, H, W)
-            refine: Refinement of the references after each layer.
+            refine: Function that refines the references after each layer. Its arguments are the
+                index of the layer, the states of the points, and the references.
             attn_mask: True where an instance may not attend to another, or None. (N, N)
-            between: Function that changes the queries between layers, or None.
+            between: Function (index of a layer, queries) -> queries that changes the queries
+                between layers, or None.
 
         Returns:
-            The output of every layer.
+            The output of every layer: states of points and instances, and refined references.
         """
         return super().forward(
             query,
@@ -60,10 +63,12 @@ class ContentDecoder(MapDecoder):
 class HRMapNetHead(MapHead):
     """Map head whose queries have no positional half, as in HRMapNet.
 
-    MapTR splits the embedding of a query into a positional half, which predicts the first
-    reference, and a content half. Here a query is one vector: the sum of the embeddings of its
-    instance and its point. A network of three layers predicts the first reference from it.
-    `RasterPrior` conditions the queries on the map prior.
+    A reference is the current estimate of the location of a point, which each decoder layer
+    refines. MapTR splits the embedding of a query into two halves of C channels. A linear layer
+    predicts the first reference from the positional half, and the other half is the content. Here a
+    query is one vector of C channels: the sum of the embeddings of its instance and its point. A
+    network of three layers predicts the first reference from it. `RasterPrior` can condition the
+    queries on a map of earlier predictions.
 
     Args:
         decoder: Settings of `ContentDecoder`.
@@ -81,10 +86,13 @@ class HRMapNetHead(MapHead):
             embed_dims=embed_dims,
             **kwargs,
         )
+        # The embeddings of `MapHead` have 2 C channels, for both halves. They are replaced by
+        # embeddings of C channels.
         num_instances = sum(group.num for group in self.query_groups)
         self.instance_embedding = nn.Embedding(num_instances, embed_dims)
-        # A table for queries of C / 2 channels has embeddings of C channels.
+        # `PointTable` has twice as many channels as its second argument, here C.
         self.pts_embedding = PointTable(num_points, embed_dims // 2)
+        # `initial` is the layer of MapTR that predicts the first references.
         reference: Any = self.reference
         out_dims = reference.initial.out_features
         reference.initial = mlp(embed_dims, embed_dims, embed_dims, out_dims)
@@ -96,15 +104,17 @@ class HRMapNetHead(MapHead):
         init_matrices(reference.initial)
 
     def queries(self) -> tuple[Tensor, Tensor]:
-        """Queries of all groups in training, and of the first group in prediction.
+        """Queries of all query groups in training, and of the first group in prediction.
+
+        Further groups exist only to train the decoder.
 
         Returns:
-            The vectors that predict the first references, and the content of the queries: twice the
-            same tensor. (N * P, C)
+            The vectors that predict the first references, and the content of the queries. Both are
+            one tensor. (N * P, C)
         """
         embeddings = self.instance_embedding.weight
         if not self.training:
             embeddings = embeddings[: self.query_groups[0].num]
         assert self.pts_embedding is not None  # set in the constructor
-        query = self.pts_embedding(embeddings).flatten(0, 1)
+        query = self.pts_embedding(embeddings).flatten(0, 1)  # (N, P, C) -> (N * P, C)
         return query, query

@@ -1,4 +1,8 @@
-"""Targets of line heads: lines cut at the border of the map, their key points and their masks."""
+"""Targets of line heads: lines cut at the border of the map, their key points and their masks.
+
+Points (u, v) are relative positions in the map. u is 0 at its front edge and 1 at its rear edge.
+v is 0 at its left edge and 1 at its right edge.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,7 +23,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
 Points = NDArray[np.float64]
-Part = tuple[int, Points]  # class index, and a line (u, v) in [0, 1] from the front and the left
+Part = tuple[int, Points]  # class index and points (u, v) of a line that is cut at the border
 
 
 def orient_line(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
@@ -29,7 +33,8 @@ def orient_line(line: Points, tolerance: float, sort_rings: bool = False) -> Poi
 
     Args:
         line: Points (u, v) from the front and from the left. (n, 2)
-        tolerance: Largest difference in u of two level ends, in the unit of the points.
+        tolerance: Largest difference in u at which the ends count as level, in the unit of the
+            points.
         sort_rings: Whether rings start at their rearmost vertex and run clockwise.
 
     Returns:
@@ -70,7 +75,7 @@ def draw_lines(
     for line in lines:
         # (u, v) times (H, W) gives (row, column), and OpenCV expects (column, row).
         cells = (line * size)[:, ::-1].astype(np.int32)
-        canvas = np.zeros(size, dtype=np.uint8)
+        canvas = np.zeros(size, dtype=np.uint8)  # OpenCV does not draw on boolean arrays
         mask = cv2.polylines(canvas, [cells], isClosed=False, color=(1,), thickness=thickness_px)
         masks.append(mask.astype(bool))
     rows, columns = size
@@ -82,7 +87,8 @@ def draw_lines(
 class FormatLineTargets(BaseTransform):
     """Transform that makes the targets of a `LineHead`: key points and a mask of each line.
 
-    It sets ``gt_instances_3d`` with the fields
+    A subclass defines the key points by `class_setting`, `max_points` and `points`. The transform
+    sets ``gt_instances_3d`` with the fields
 
     - ``labels_3d``: Class indices. (K,)
     - ``pts``: Key points in metres, padded with the last one. (K, P, 2)
@@ -171,9 +177,11 @@ class FormatLineTargets(BaseTransform):
             counts.append(len(key_points))
             points_m.append(grid.metres_from_front(key_points))
             polylines.append(self.polyline(key_points, label))
+        # `front_size` returns the pixels along the direction of travel and across it.
         masks, redrawn = self.masks(parts, polylines=polylines, size=front_size(grid))
         results["gt_instances_3d"] = InstanceData(
             labels_3d=torch.tensor(labels, dtype=torch.int64),
+            # `pad_lines` repeats the last point of each line up to the number of points.
             pts=torch.from_numpy(pad_lines(points_m, self.max_points())).float(),
             num_pts=torch.tensor(counts, dtype=torch.int64),
             masks=torch.from_numpy(masks),
@@ -187,9 +195,13 @@ class FormatLineTargets(BaseTransform):
         Args:
             results: Sample with ``x_range``, ``y_range`` and the ground truth.
 
+        Returns:
+            Class and points (u, v) of each part, and the raster.
+
         Raises:
-            ValueError: If there is no ground truth.
+            ValueError: If there is no ground truth, or `class_setting` has no value for a class.
         """
+        # The transform is only passed to be named in the error of a sample without ground truth.
         elements = sorted(ground_truth_elements(results, self), key=lambda element: element.label)
         grid = BEVGrid(results["x_range"], results["y_range"]).rasterized(self.pixel_m)
         parts = []
@@ -226,9 +238,11 @@ class FormatLineTargets(BaseTransform):
             lines = [points_m[start : start + 2] for start in longest_edges]
         parts = []
         for line in lines:
-            samples = points_at_steps(line, self.step_m)  # without the end of the line
+            # The samples begin at the first vertex and do not include the last one.
+            samples = points_at_steps(line, self.step_m)
             if self.sort_rings and is_closed(line):  # append the first point to close the ring
                 samples = np.concatenate([samples, line[:1]])
+            # A line that leaves the map and returns has several parts.
             for part_m in parts_inside(samples, x_range=grid.x_range, y_range=grid.y_range):
                 parts.append(grid.front_from_metres(part_m))
         return parts
@@ -242,7 +256,7 @@ class FormatLineTargets(BaseTransform):
 
         Args:
             parts: Class and points of each line.
-            polylines: Polyline through the key points of each line.
+            polylines: Polyline (u, v) through the key points of each line.
             size: Rows H and columns W of the masks.
 
         Returns:

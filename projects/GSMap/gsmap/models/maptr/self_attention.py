@@ -1,10 +1,10 @@
 """Self-attention of point queries.
 
-The constructor of a self-attention takes ``embed_dims`` (channels C), ``num_heads``, ``num_points``
-(points P per instance) and ``dropout``. The inputs of its call are point queries, instance after
-instance (B, N * P, C), positional queries of equal shape, and a mask (N, N) or None. The mask is
-True where an instance may not attend to another one. The output is the sum of queries and
-attention, without normalisation.
+Every self-attention that a decoder layer can use has this interface. Its constructor takes
+``embed_dims`` (channels C), ``num_heads``, ``num_points`` (points P per instance) and ``dropout``.
+The inputs of its call are point queries, instance after instance (B, N * P, C), positional queries
+of equal shape, and a mask (N, N) or None. The mask is True where an instance may not attend to
+another one. The output is the sum of queries and attention; the decoder layer normalises it.
 """
 
 from mmdet3d.registry import MODELS
@@ -37,15 +37,21 @@ class PointSelfAttention(nn.MultiheadAttention):
         Args:
             query: Point queries, instance after instance. (B, N * P, C)
             query_pos: Positional queries. (B, N * P, C)
-            attn_mask: True where an instance may not attend to another one. (N, N)
+            attn_mask: True where an instance may not attend to another one; None allows all pairs.
+                (N, N)
 
         Returns:
             The queries plus the attention. (B, N * P, C)
         """
         point_mask = mask_of_points(attn_mask, num_points=self.num_points)
-        key = query + query_pos
+        # Positions influence the attention weights, but they are not part of the attended values.
+        positioned_query = query + query_pos
         attended, _ = super().forward(
-            query=key, key=key, value=query, attn_mask=point_mask, need_weights=False
+            query=positioned_query,
+            key=positioned_query,
+            value=query,
+            attn_mask=point_mask,
+            need_weights=False,
         )
         return query + self.output_dropout(attended)
 

@@ -22,7 +22,8 @@ class RenderedDiceCost(MapCost):
     Args:
         weight: Weight of the cost.
         size: Rows H and columns W of the rasters.
-        rendering: Further settings of `ElementRenderer`.
+        rendering: Further settings of `ElementRenderer`. It renders classes in ``polygon_classes``
+            as filled polygons, and all others as lines.
     """
 
     def __init__(
@@ -33,7 +34,7 @@ class RenderedDiceCost(MapCost):
 
     def check(self, head: BuiltHead) -> None:
         """Raise ValueError if a class of ``polygon_classes`` does not exist."""
-        self.renderer.check(self, head)
+        self.renderer.check(self, head)  # the message names the class of this cost
 
     def __call__(
         self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
@@ -52,11 +53,13 @@ class RenderedDiceCost(MapCost):
         preds = pred_instances.pts
         is_polygon = self.renderer.is_polygon(gt_instances.labels)
         targets = self.renderer.render(gt_instances.first_pts, is_polygon)
+        # A prediction is paired with ground truths of all classes, so it is rendered in both ways.
         all_lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
         all_polygons = torch.ones_like(all_lines)
         lines = self.renderer.render(preds, is_polygon=all_lines)  # (N, H, W)
         polygons = self.renderer.render(preds, is_polygon=all_polygons)
         line_costs = pairwise_dice_loss(lines, targets)  # (N, K)
         polygon_costs = pairwise_dice_loss(polygons, targets)
-        costs = torch.where(is_polygon, polygon_costs, line_costs)
+        costs = torch.where(is_polygon, polygon_costs, line_costs)  # (K,) selects columns
+        # `class_weights` returns one weight for all, or the weight of each ground truth's class.
         return costs * class_weights(self.weight, gt_instances.labels)

@@ -22,12 +22,13 @@ class ElementRenderer:
     """Soft renderer of map elements as in MapVR: lines or filled polygons, depending on the class.
 
     Args:
-        size: Rows H and columns W of the masks.
+        size: Rows H and columns W of the rasters.
         line_softness: Softness of lines (tau), in pixels, or squared pixels if ``distance`` is
             ``"squared"``.
         polygon_softness: Softness of polygons, in the unit of ``line_softness``.
         polygon_classes: Indices of the classes that are rendered as filled polygons.
-        distance: ``"squared"`` or ``"plain"`` (see `gsmap.ops.polyline_raster.soft_rasters`).
+        distance: Distance D in the value exp(-D / tau) of a line's pixel: ``"squared"`` distance of
+            the pixel from the nearest edge, or ``"plain"`` distance (`soft_rasters`).
 
     Raises:
         ValueError: If a setting is outside its range.
@@ -63,17 +64,18 @@ class ElementRenderer:
 
     def is_polygon(self, labels: Tensor) -> Tensor:
         """Whether elements of the given labels are rendered as polygons. (n,) -> (n,)"""
+        # `constant` uploads the indices once and caches them on the device of the labels.
         return torch.isin(labels, constant(labels, self.polygon_classes))
 
     def render(self, points: Tensor, is_polygon: Tensor) -> Tensor:
-        """Render elements to soft masks.
+        """Render elements to soft rasters.
 
         Args:
-            points: Normalised vertices. (n, P, 2)
+            points: Vertices (x, y), [0, 1] over the map. (n, P, 2)
             is_polygon: True for filled polygons, False for lines. (n,)
 
         Returns:
-            Masks in [0, 1]. (n, H, W)
+            Rasters in [0, 1]. (n, H, W)
         """
         height, width = self.size
         pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], dim=-1)
@@ -98,8 +100,9 @@ class RenderedDiceLoss(MapLoss):
     Args:
         loss_weight: Weight of the loss.
         size: Rows H and columns W of the rasters.
-        last_layer_only: As in `MapLoss`.
-        first_group_only: As in `MapLoss`.
+        last_layer_only: Compute the loss for the last decoder layer only.
+        first_group_only: Compute the loss for the first query group only, the only group that is
+            used in prediction.
         rendering: Further settings of `ElementRenderer`.
     """
 
@@ -142,7 +145,7 @@ class SelfDirectionLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss.
-        flags: As in `MapLoss`.
+        flags: ``last_layer_only`` and ``first_group_only``, as in `RenderedDiceLoss`.
     """
 
     name = "dir"
@@ -152,5 +155,6 @@ class SelfDirectionLoss(MapLoss):
 
     def values(self, pairs: MatchedPairs) -> Tensor:
         """One minus the cosine at each inner vertex of M matched pairs. (M, P - 2)"""
-        edges = pairs.pred_pts_m.diff(dim=1)
+        edges = pairs.pred_pts_m.diff(dim=1)  # (M, P - 1, 2)
+        # `turns` returns one minus the cosine of the angle between two edges.
         return turns(edges[:, :-1], edges[:, 1:])

@@ -1,25 +1,31 @@
 """Mapping between the state keys of the released MGMap and of this project.
 
-`rules_of` takes the prefix of the released keys, the prefix of this project's keys, and the pairs
-of remainders after the prefixes as one text. A pair is ``released=here``, or a single name if both
-remainders are equal.
+A rule is a pair of key prefixes, released and here. It renames the beginning of a key, and the rest
+of the key is kept. ``{i}`` stands for a number, which is equal on both sides.
+
+`rules_of` makes several rules. It takes the prefix of the released keys, the prefix of this
+project's keys, and one text of pairs, separated by blanks. A pair is ``released=here`` and extends
+both prefixes.
 """
 
 from gsmap.checkpoints.key_rules import KeyMap, Rules, rules_of
 from gsmap.models.maptr.keys import CODE_WEIGHTS, GRID_OFFSETS, HEAD, MAPTR, TRANSFORMER
 
+# Released prefix and prefix here of the network that enhances the BEV features.
 _ENHANCED = TRANSFORMER + "bevencode."
 _NECK = "map_head.decoder.neck."
+# Residual blocks of the three stages of this network.
 _BLOCKS = (
     (_ENHANCED + "layer1.{i}.", _NECK + "stages.0.{i}."),
     (_ENHANCED + "layer2.{i}.", _NECK + "stages.1.{i}."),
     (_ENHANCED + "layer3.{i}.", _NECK + "stages.2.{i}."),
 )
+# Network that predicts the masks of instances.
 _MASK_NET = (TRANSFORMER + "decoder.ins_conv.", "map_head.decoder.mask_net.")
 
 
 def _gate_rules() -> Rules:
-    """Return the rules of the gates of all blocks."""
+    """Return the rules of the gates, the channel and spatial attention in each block."""
     rules: list[tuple[str, str]] = []
     for theirs, ours in _BLOCKS:
         rules += rules_of(theirs, ours, names="ca.fc.=gates.channel. sa.conv1.=gates.space.")
@@ -57,11 +63,15 @@ MGMAP = KeyMap(
             "glimpse_transformer_{i}.decoder.norm.=norm. rego_hs_fuser_{i}.0.=fuser.0. "
             "layer_norms_{i}.0.=fuser.1.",
         ),
+        # The remaining keys are named as in MapTR, on which MGMap is built.
         *MAPTR.rules,
     ),
+    # Released keys without a counterpart here. Conversion back to the released format adds them.
     unused=CODE_WEIGHTS,
+    # Keys of the mask network distinguish checkpoints of MGMap from checkpoints of MapTR.
     markers=(_MASK_NET,),
-    # modules that are never called, an alias of glimpse_transformer_0, and weights of a loss
+    # Further released keys without a counterpart, which conversion back leaves out: modules that
+    # are never called, an alias of glimpse_transformer_0, weights of a loss, and fixed offsets.
     ignored_pattern=r"pts_bbox_head\.(conv_seg|glimpse_transformer|loss_fn_?|(cls|reg)_branches\.[6-9]|"
     r"transformer\.bevencode\.(fpn_conv|attention)|(rego_hs_fuser|layer_norms)_\d\.[1-5])\.|"
     + GRID_OFFSETS,

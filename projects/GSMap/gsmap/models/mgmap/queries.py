@@ -23,15 +23,20 @@ class PointsOfInstances(nn.Linear):
 
     def forward(self, instances: Tensor) -> Tensor:
         """Compute the embeddings of the points of instances. (N, 2 C) -> (N, P, 2 C)"""
-        points = super().forward(instances).unflatten(1, (self.num_points, -1))
-        return instances[:, None] + points
+        point_terms = super().forward(instances).unflatten(1, (self.num_points, -1))
+        return instances[:, None] + point_terms  # each point also has the embedding of its instance
 
 
+# The decorator adds the setting `points_from_instances` to `MapHead`. If a config has it, the head
+# calls this function and uses the returned settings in its place.
 @head_setting("points_from_instances")
 def points_from_instances(value: bool) -> PartConfig:
     """Return the settings of a head with `PointsOfInstances`.
 
     Args:
         value: Whether the head computes point embeddings from instance embeddings.
+
+    Returns:
+        Settings of `MapHead`; empty if ``value`` is False.
     """
     return {"point_queries": {"type": PointsOfInstances}} if value else {}

@@ -1,4 +1,8 @@
-"""Fusion of detections with the elements of earlier drives."""
+"""Fusion of detections with the elements of earlier drives.
+
+An `ElementPrior` is a map of earlier drives. It stores elements in the global frame of a place,
+such as a town. Each element has a class and a confidence.
+"""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -20,7 +24,9 @@ from gsmap.structures.line_update import nearest_places
 from gsmap.structures.polylines import resample_all
 from gsmap.utils.errors import InputError
 
-_CELL_M = 0.3  # side of the cells of the window of a `PriorModule`; elements need no cells
+# Side of the cells of `PriorModule.window`. Elements need no cells: only the extent of the window
+# is used here.
+_CELL_M = 0.3
 
 
 @MODELS.register_module()
@@ -75,6 +81,13 @@ class ElementFusion(PriorModule):
     def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
         """Check the priors of a user, and prepare them as `PriorModule.maps_of` does.
 
+        Args:
+            priors: The priors, one for each place.
+            update: Whether to write each frame to the priors, which an `ElementPrior` refuses.
+
+        Returns:
+            The maps, as arguments of `PriorModule.use`.
+
         Raises:
             ValueError: If a prior is no `ElementPrior`, has other classes, or is to be written.
         """
@@ -93,7 +106,7 @@ class ElementFusion(PriorModule):
 
         Args:
             results: Detections of each sample, as predicted by the head.
-            metas: Metainfo of each sample.
+            metas: Metainfo of each sample, with its pose ``lidar2global`` and ``map_name``.
 
         Returns:
             Detections of each sample, highest score first. Without a prior, these are ``results``.
@@ -108,9 +121,10 @@ class ElementFusion(PriorModule):
             return list(results)
         updated = []
         for detections, meta in zip(results, metas, strict=True):
-            place = maps.require_place(Place.of(meta))
-            prior = maps.find(place)
+            place = maps.require_place(Place.of(meta))  # an error if the sample has no pose
+            prior = maps.find(place)  # an error if no prior is of this place
             assert isinstance(prior, ElementPrior)  # `maps_of` has checked it
+            # The elements are cut at the window and are in the annotation frame of the sample.
             elements = prior.read_elements(place.pose, self.window)
             updated.append(self._fuse_sample(detections, elements, sigma_m=prior.rule.sigma_m))
         return updated
@@ -132,8 +146,14 @@ class ElementFusion(PriorModule):
 
         Args:
             detections: Detections of the head.
-            elements: Elements of the prior in the frame.
+            elements: Elements of the prior in the range of the sample, in its annotation frame.
             sigma_m: Standard deviation of the points of elements across their lines, in metres.
+
+        Returns:
+            The E elements and the detections that belong to none of them, highest score first.
+
+        Raises:
+            ValueError: If detections have heights or fields that elements do not have.
         """
         if not len(elements):
             return detections
@@ -148,18 +168,22 @@ class ElementFusion(PriorModule):
         labels = torch.from_numpy(elements.labels).to(detections.labels_3d)
         confidences = torch.from_numpy(elements.confidence).to(detections.scores_3d)
         distances = _distances(points, labels=detections.labels_3d, lines=lines, line_labels=labels)
-        smallest_m, element_inds = distances.min(1)  # (N,)
+        smallest_m, element_inds = distances.min(1)  # nearest element of each detection (N,)
         belongs = smallest_m < self.gate_m
         matched_scores = torch.where(belongs, detections.scores_3d, 0.0)
         best_scores = torch.zeros_like(confidences)
+        # Largest score of the detections of each element, 0 for an element without detections.
         best_scores.scatter_reduce_(0, element_inds, matched_scores, reduce="amax")
+        # The formula of the class, with the shares m + (1 - m) s.
         shares = self.missed_share + (1 - self.missed_share) * best_scores
         scores = 1 - (1 - shares * confidences) * (1 - best_scores)
         fields = {"pts": lines, "labels_3d": labels, "scores_3d": scores}
         if self.has_gaussians:
+            # Along a line, sigmas follow from the distances of its points.
             gaussians = gaussians_along(lines, across_m=sigma_m)
             fields["scales"] = gaussians.scales.to(detections.scales)
             fields["rotations"] = gaussians.rotations.to(detections.rotations)
+        # Every field of the detections must be filled for the elements as well.
         unknown = sorted(set(detections.keys()) - set(fields))
         if unknown:
             raise InputError(
@@ -189,7 +213,9 @@ def _distances(points: Tensor, labels: Tensor, lines: Tensor, line_labels: Tenso
         the line of the element, and of the points of the element to the line of the detection.
         Infinite if the classes differ. (N, E)
     """
+    # Distances are computed only for the pairs of equal class.
     rows, columns = (labels[:, None] == line_labels).nonzero(as_tuple=True)
+    # `nearest_places` finds the nearest position on a line for each point, with its distance.
     to_lines = nearest_places(points[rows], lines[columns]).distances.mean(-1)
     to_detections = nearest_places(lines[columns], points[rows]).distances.mean(-1)
     distances = points.new_full((len(labels), len(line_labels)), torch.inf)

@@ -42,7 +42,7 @@ class StreamMapNetEncoderLayer(BEVEncoderLayer):
 
 @MODELS.register_module()
 class StreamMapNetEncoder(BEVQueryEncoder):
-    """`BEVQueryEncoder` that does not receive the vehicle's motion (StreamMapNet).
+    """`BEVQueryEncoder` that does not receive the vehicle's motion signals (StreamMapNet).
 
     Inside the encoder, row 0 is at the largest y, as in the released weights. Row 0 of its output
     is at the smallest y, as in all encoders.
@@ -65,6 +65,7 @@ class StreamMapNetEncoder(BEVQueryEncoder):
         **kwargs: Any,
     ) -> None:
         kwargs["layer_cfg"] = {"mirrored": mirrored_self_attn, **(layer_cfg or {})}
+        # The CAN bus has the signals of the vehicle's motion.
         super().__init__(**kwargs, num_levels=num_levels, with_can_bus=False)
 
     def encode(
@@ -79,13 +80,17 @@ class StreamMapNetEncoder(BEVQueryEncoder):
             img_shape: Rows and columns of the padded images.
 
         Returns:
-            ``bev_feats``. (B, C, H, W)
+            ``bev_feats`` (B, C, H, W), with row 0 at the smallest y. The image features, which the
+            base class also returns, are left out.
         """
         bev_feats = super().encode(feats, calibration, img_shape=img_shape)["bev_feats"]
         return {"bev_feats": bev_feats.flip(2)}
 
     def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
         """Project the pillars of all cells into every camera. Row 0 of the cells has the largest y.
+
+        A pillar is the vertical row of points above a cell. `encode` of the base class calls this
+        method. The method of the base class has row 0 at the smallest y, so its rows are flipped.
 
         Args:
             img_from_frame: Transforms from the map frame in metres to pixels. (B, V, 4, 4)

@@ -17,10 +17,14 @@ from gsmap.models.streammapnet.reference import LineReference
 
 
 class BestClassCoder(MapCoder):
-    """Selects queries with their best class, so that no query occurs with two classes."""
+    """Selects queries with their best class, so that no query occurs with two classes.
+
+    The base class `MapCoder` selects pairs of query and class. It calls `best` and then drops
+    detections with points far outside of the map, if ``margin_m`` is not None.
+    """
 
     def best(self, scores: Tensor) -> Detections:
-        """Select the best queries, the highest score first, from class logits (N, classes)."""
+        """Select up to ``max_num`` queries, highest score first, from class logits (N, classes)."""
         best_scores, labels = scores.float().sigmoid().max(dim=-1)
         top_scores, order = best_scores.topk(min(self.max_num, len(best_scores)))
         return Detections(top_scores, labels[order], query_inds=order)
@@ -31,7 +35,7 @@ class StreamMapNetHead(MapHead):
     """Map head with StreamMapNet's parts.
 
     Args:
-        decoder: Settings of `StreamMapNetDecoder`.
+        decoder: Settings that replace or extend the defaults of `StreamMapNetDecoder`.
         reference: Settings of `LineReference`.
         coder: Settings of `BestClassCoder`; by default it keeps all queries.
         num_points: Points per instance P.
@@ -60,15 +64,21 @@ class StreamMapNetHead(MapHead):
         num_queries = sum(group.num for group in self.query_groups)
         self.instance_embedding = nn.Embedding(num_queries, self.embed_dims)
         branch = nn.Linear(self.embed_dims, len(self.classes))
-        # All decoder layers share the class branch. `LineReference` shares its regression branch.
+        # `MapHead` has created a branch per decoder layer. Here all entries are one module, and
+        # `LineReference` shares its regression branch in the same way.
         self.cls_branches = nn.ModuleList([branch] * len(self.cls_branches))
-        # By default all queries are kept, also those with points far beyond the map.
+        # By default all queries of the first group, the only one in prediction, are kept: also
+        # queries with points far beyond the map (no margin).
         coder_settings: PartConfig = {"max_num": self.query_groups[0].num, "margin_m": None}
         coder_settings |= coder or {}
         self.coder = BestClassCoder(grid=self.grid, **coder_settings)
 
     def queries(self) -> tuple[Tensor, Tensor]:
-        """Return the query embeddings twice: for the initial lines, and as the decoder's input."""
+        """Return the query embeddings twice: for the initial lines, and as the decoder's input.
+
+        `MapHead` calls this method, and splits each embedding into two halves if it is not
+        overridden.
+        """
         query = self.instance_embedding.weight
         if not self.training:  # later groups are used only in training
             query = query[: self.query_groups[0].num]

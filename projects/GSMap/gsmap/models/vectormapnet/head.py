@@ -23,7 +23,9 @@ from gsmap.utils.errors import InputError
 class VectorMapNetHead(DetectionHead):
     """Head that detects elements with another head and generates a polyline in each box.
 
-    A line has the class and the score of its element. Lines of fewer than two points are dropped.
+    The detector predicts the class, the score and the box of each element. The generator writes the
+    coordinates of a line as tokens: numbers of pixels of the canvas, a raster over the map. A line
+    has the class and the score of its element. Lines of fewer than two points are dropped.
 
     Args:
         grid: Extent of the map, in metres.
@@ -37,6 +39,10 @@ class VectorMapNetHead(DetectionHead):
 
     Raises:
         ValueError: If the detector is a `KeyPointHead` with another canvas.
+
+    Attributes:
+        transforms: Transforms of the training pipeline that make the targets of the head.
+        not_exported: Reason why the head has no ONNX export.
     """
 
     transforms = ("FormatPolylineTargets",)
@@ -63,7 +69,7 @@ class VectorMapNetHead(DetectionHead):
         self.canvas = Canvas(grid, **(canvas or {}))
         detector_settings: PartConfig = {"type": "KeyPointHead", "grid": grid, "classes": classes}
         detector_settings |= detector or {}
-        if detector_settings["type"] == "KeyPointHead":
+        if detector_settings["type"] == "KeyPointHead":  # which has a canvas as well
             detector_settings = {"canvas": canvas, **detector_settings}
         self.detector: DetectionHead = MODELS.build(detector_settings)
         detector_canvas = self.canvas
@@ -80,15 +86,26 @@ class VectorMapNetHead(DetectionHead):
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of `FormatPolylineTargets` that follow from the head's settings."""
+        """Return the settings of `FormatPolylineTargets` that follow from the head's settings.
+
+        Targets and head must have equal canvases, so the settings of the canvas are returned.
+
+        Args:
+            settings: Settings of the head.
+        """
         return dict(settings["canvas"] or {})
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Fit the state of a checkpoint to the detector, in place."""
+        """Fit the state of a checkpoint to the detector, in place. The generator needs no change.
+
+        Args:
+            state: Tensors of the checkpoint, by name.
+            prefix: Prefix of the names of this head.
+        """
         self.detector.fit_state(state, f"{prefix}detector.")
 
     def forward(self, bev_outputs: Tensors) -> Sequence[object]:
-        """Return the predictions of the detector."""
+        """Return the predictions of each layer of the detector, without generated lines."""
         return self.detector(bev_outputs)
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
@@ -100,11 +117,15 @@ class VectorMapNetHead(DetectionHead):
             bev_outputs: Outputs of the BEV encoder: ``bev_feats``. (B, C', H, W)
             batch_data_samples: Samples with the targets of `FormatPolylineTargets`.
 
+        Returns:
+            Losses by their names.
+
         Raises:
             ValueError: If a sample has no targets, or targets of another canvas (raised by
                 `get_targets`).
         """
         losses = self.detector.loss(bev_outputs, batch_data_samples)
+        # Classes, boxes, tokens and token weights of the annotated elements of each sample.
         truths = [get_targets(sample, self.canvas) for sample in batch_data_samples]
         sequence_losses = []
         for feats, truth in zip(bev_outputs["bev_feats"], truths, strict=True):
@@ -113,6 +134,8 @@ class VectorMapNetHead(DetectionHead):
                 feats, elements, tokens=truth.tokens, weights=truth.token_weights
             )
             sequence_losses.append(sequence_loss)
+        # The generator returns sums over tokens. Divided by the weights of all tokens of the batch,
+        # they give the weighted mean over tokens.
         total_weight = torch.cat([truth.token_weights.flatten() for truth in truths]).sum()
         loss_seq = torch.stack(sequence_losses).sum() / total_weight.clamp(min=1e-6)
         return losses | {"loss_seq": self.loss_weight * loss_seq}
@@ -125,8 +148,9 @@ class VectorMapNetHead(DetectionHead):
             batch_data_samples: Samples of the batch.
 
         Returns:
-            For each sample ``pts`` in metres (M, P, 2), ``num_pts`` (M,), ``labels_3d`` (M,) and
-            ``scores_3d`` (M,).
+            For each sample the points ``pts`` in metres (M, P, 2), the number of points of each
+            line ``num_pts`` (M,), ``labels_3d`` (M,) and ``scores_3d`` (M,). In ``pts``, the last
+            point of a line is repeated to the end of the row.
         """
         detections = self.detector.predict(bev_outputs, batch_data_samples)
         results = []
@@ -142,18 +166,20 @@ class VectorMapNetHead(DetectionHead):
     ) -> InstanceData:
         """Generate the lines of one sample's elements, with a random seed from the sample's name.
 
+        The random numbers of a sample thus do not depend on the samples before it.
+
         Args:
             feats: BEV features of the sample. (C', H, W)
             detections: Elements of the detector: ``pts``, ``labels_3d`` and ``scores_3d``.
-            meta: Metadata of the sample, with its name ``token``.
+            meta: Metadata of the sample, with its name as ``token``.
 
         Returns:
-            Lines of two or more points: ``pts`` in metres (M, P, 2), ``num_pts`` (M,),
-            ``labels_3d`` (M,) and ``scores_3d`` (M,).
+            Lines of two or more points, in the format of `predict`.
         """
+        # Python's `hash` of a text differs between processes, a checksum does not.
         seed = zlib.crc32(str(meta.get("token")).encode())
         elements = Elements(detections.labels_3d, self.boxes(detections))
-        with torch.autocast(feats.device.type, enabled=False):
+        with torch.autocast(feats.device.type, enabled=False):  # float32, even in mixed precision
             draw = self.generator.seeded_draw(seed)
             tokens = self.generator.generate(feats.float(), elements, draw=draw)
         points, num_points = self.generator.lines(tokens)

@@ -12,7 +12,9 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError, InputTypeError
 
-# Arguments of the operators. `frame` is the position and the pixel size of the raster.
+# Arguments of the operators, as a schema of torch. `gaussians` (N, P, 5) are the centres, scales
+# and rotations of N instances. `frame` has 4 numbers: the corner of the raster and the size of its
+# pixels.
 _ARGUMENTS = "Tensor gaussians, float[] frame, int height, int width"
 
 
@@ -21,6 +23,7 @@ def _masks_shape(gaussians: Tensor, frame: list[float], height: int, width: int)
     return len(gaussians), height, width
 
 
+# Operators that call the fused kernels in the modules `numba.py` and `triton.py` of this folder.
 # Only the first argument of both operators has a gradient (`differentiable=1`).
 _render = fused_operator(
     "gaussian_raster.render_gaussians", _ARGUMENTS, shape=_masks_shape, differentiable=1
@@ -36,7 +39,7 @@ def render_gaussians(
     r"""Render the 2D Gaussians of each map element to a soft occupancy raster.
 
     The value of a pixel :math:`p` is :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6). Here
-    :math:`G_i(p)` is the density of Gaussian i, which is 1 at its centre (Eq. 2). The computation
+    :math:`G_i(p)` is the value of Gaussian i, scaled to 1 at its centre (Eq. 2). The computation
     is in the widest type of the inputs, but at least in float32, even under autocast.
 
     Args:
@@ -44,7 +47,8 @@ def render_gaussians(
         scales: Standard deviations along the axes of each Gaussian, in metres, > 0. (..., P, 2)
         rotations: Angle of the first axis from +x, in radians, anticlockwise. (..., P)
         grid: Extent of the raster in metres and its size in pixels, H rows and W columns.
-        backend: Backend, see `choose_backend`.
+        backend: ``"auto"``, ``"reference"`` (plain torch), ``"cpu"`` (numba) or ``"triton"``, see
+            `choose_backend`.
 
     Returns:
         Occupancy in [0, 1], differentiable in the first three inputs. (..., H, W)
@@ -67,10 +71,12 @@ def render_gaussians(
                 grid=grid,
             )
         batch_shape = means.shape[:-2]
+        # The size is given in place of -1, which is ambiguous for tensors without elements.
         flat = gaussians.reshape(math.prod(batch_shape), means.shape[-2], 5)
         # Corner of the raster with the smallest x and y, and the sides of a pixel, in metres.
         frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
         # The kernel with one warp per tile replaces the default kernel if the user has enabled it.
+        # `AUTO_KERNELS` is read from its module at each call, because tests replace it.
         in_warps = backend == "triton" and "render_gaussians_in_warps" in backends.AUTO_KERNELS
         render = _render_in_warps if in_warps else _render
         masks = render(flat, frame, height=grid.height, width=grid.width, backend=backend)

@@ -2,17 +2,21 @@
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels of the raster loss, with separable blurs, in float32.
 
-In this file, p is the predicted mask and t is the ground-truth mask. A program computes ``BLOCK``
-consecutive pixels of one instance. In the forward pass, the first kernel blurs p, t, p^2 + t^2 and
-p t along rows. The second kernel blurs them along columns, computes SSIM, and writes the sums of
-its block to separate entries of a buffer (n, blocks, 7). There are no atomics, so repeated runs
+In this file, p is the predicted mask and t is the ground-truth mask of one of n instances. A
+program computes ``BLOCK`` consecutive pixels of one instance. All kernels but `slope_rows_kernel`
+have the grid of programs (blocks, n). In the forward pass, the first kernel blurs p, t, p^2 + t^2
+and p t along rows. The second kernel blurs them along columns, computes SSIM, and writes the sums
+of its block to separate entries of a buffer (n, blocks, 7). There are no atomics, so repeated runs
 give bitwise equal results.
+
+SSIM needs the variances of p and t only as their sum, so p^2 and t^2 are blurred together. With
+respect to p, the derivative of the blurred p^2 + t^2 is the derivative of the blurred p^2.
 
 The backward pass computes the blurs again and, from them, the derivatives of SSIM with respect to
 the blurred p, p^2 and p t. The gradient with respect to a map before its blur is the transposed
 blur of the derivative. As the window is symmetric, the transposed blur equals the blur, so the
-derivatives are blurred once more. Neighbours are read from the cache, once for each tap (weight) of
-the window.
+derivatives are blurred once more. A kernel loads the neighbours of a pixel once for each tap
+(weight) of the window. Most of these loads are served by the cache.
 """
 
 import torch
@@ -21,12 +25,13 @@ import triton.language as tl
 
 from gsmap.ops.raster_loss.reference import MIN_COVERAGE, SSIM_C1, SSIM_C2
 
-BLOCK = 256
+BLOCK = 256  # pixels of a program
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 # Where both masks are empty, numerator and denominator of SSIM are equal products, and their
 # difference must be exactly 0. A fused multiply-add would subtract an unrounded product from a
 # rounded product, so that the rounding error would remain.
 EXACT_OPTIONS = {**OPTIONS, "enable_fp_fusion": False}
+# Kernels can read global values only if they are `tl.constexpr`.
 C1 = tl.constexpr(SSIM_C1)
 C2 = tl.constexpr(SSIM_C2)
 COVERAGE = tl.constexpr(MIN_COVERAGE)
@@ -34,8 +39,11 @@ COVERAGE = tl.constexpr(MIN_COVERAGE)
 
 @triton.jit
 def _block(height, width, BLOCK: tl.constexpr):
-    """Return a program's instance, the number of pixels per instance, and the block's pixels."""
-    n = tl.program_id(1).to(tl.int64)
+    """Return a program's instance, the number of pixels per instance, and the block's pixels.
+
+    The last block of an instance may have indices of pixels beyond the instance.
+    """
+    n = tl.program_id(1).to(tl.int64)  # offsets such as n * 4 * pixels may exceed 32 bits
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     return n, height * width, index
 
@@ -57,13 +65,13 @@ def rows_kernel(
         BLOCK: Number of pixels of a program.
     """
     n, pixels, index = _block(height, width, BLOCK=BLOCK)
-    col = index % width
+    col = index % width  # a tap beyond the left or right edge would be in another row
     mean_p = tl.zeros((BLOCK,), dtype=tl.float32)
     mean_t = tl.zeros((BLOCK,), dtype=tl.float32)
     squares = tl.zeros((BLOCK,), dtype=tl.float32)
     product = tl.zeros((BLOCK,), dtype=tl.float32)
     for tap in tl.static_range(TAPS):
-        shift = tap - TAPS // 2
+        shift = tap - TAPS // 2  # from the centre of the window
         inside = (index < pixels) & (col + shift >= 0) & (col + shift < width)
         p = tl.load(preds + n * pixels + index + shift, mask=inside, other=0.0)
         t = tl.load(targets + n * pixels + index + shift, mask=inside, other=0.0)
@@ -81,20 +89,22 @@ def rows_kernel(
 
 @triton.jit
 def _blur_columns(maps, window, index, pixels, width, TAPS: tl.constexpr, BLOCK: tl.constexpr):
-    """Blur one map of an instance along columns. (BLOCK,)"""
+    """Blur one map of an instance along columns, with zeros outside of the map. (BLOCK,)"""
     total = tl.zeros((BLOCK,), dtype=tl.float32)
     for tap in tl.static_range(TAPS):
-        source = index + (tap - TAPS // 2) * width
-        inside = (index < pixels) & (source >= 0) & (source < pixels)
-        total += tl.load(window + tap) * tl.load(maps + source, mask=inside, other=0.0)
+        neighbour = index + (tap - TAPS // 2) * width
+        inside = (index < pixels) & (neighbour >= 0) & (neighbour < pixels)
+        total += tl.load(window + tap) * tl.load(maps + neighbour, mask=inside, other=0.0)
     return total
 
 
 @triton.jit
 def _ssim_terms(maps, window, n, index, pixels, width, TAPS: tl.constexpr, BLOCK: tl.constexpr):
-    """Compute the blurred p and t, and the two factors of SSIM's numerator and denominator.
+    """Compute the blurred p and t, and the terms of SSIM at the pixels of a block.
 
-    (BLOCK,) each
+    Returns:
+        Blurred p, blurred t, the two factors of SSIM's numerator (from means, from the covariance),
+        and the two factors of its denominator (from means, from variances). (BLOCK,) each
     """
     map_p = maps + n * 4 * pixels
     map_t = map_p + pixels
@@ -115,7 +125,7 @@ def _ssim_terms(maps, window, n, index, pixels, width, TAPS: tl.constexpr, BLOCK
     means = p * p + t * t
     top_mean = 2 * p * t + C1
     top_cov = 2 * (product - p * t) + C2
-    low_var = squares - means + C2
+    low_var = squares - means + C2  # the sum of both variances, plus C2
     return p, t, top_mean, top_cov, means + C1, low_var
 
 
@@ -138,7 +148,8 @@ def sums_kernel(
         preds: Predicted masks p in [0, 1], float32. (n, H, W)
         targets: Ground-truth masks t in [0, 1], float32. (n, H, W)
         window: Weights of SSIM's window, float32. (TAPS,)
-        maps: Products that `rows_kernel` blurred along rows, float32. (n, 4, H, W)
+        maps: Result of `rows_kernel`: p, t, p^2 + t^2 and p t, blurred along rows, float32.
+            (n, 4, H, W)
         sums: Output for the sums, float32. (n, blocks, 7)
         weight: Weight of a foreground pixel, relative to a background pixel.
         height: Rows H of the masks.
@@ -147,7 +158,7 @@ def sums_kernel(
         BLOCK: Number of pixels of a program.
     """
     n, pixels, index = _block(height, width, BLOCK=BLOCK)
-    ok = index < pixels
+    ok = index < pixels  # pixels beyond the instance add nothing to the sums
     mean_p, mean_t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
         maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
@@ -156,9 +167,10 @@ def sums_kernel(
     p = tl.load(preds + n * pixels + index, mask=ok, other=0.0)
     t = tl.load(targets + n * pixels + index, mask=ok, other=0.0)
     excess = (weight - 1) * t
-    # The weight of a pixel is w = 1 + excess. The sums are in the order of the reference:
-    # w |p - t|, w p, 1 - SSIM, w t, w - 1, the number of windows with part of the target, and the
-    # number of windows with part of either mask.
+    # The weight of a pixel is w = 1 + excess. Beyond the instance, p and t are 0, so sums of them
+    # need no mask. There is one window around each pixel. The sums are in the order of the
+    # reference: w |p - t|, w p, 1 - SSIM, w t, w - 1, the number of windows with part of the
+    # target, and the number of windows with part of either mask.
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * 7
     tl.store(out, tl.sum((1 + excess) * tl.abs(p - t)))
     tl.store(out + 1, tl.sum((1 + excess) * p))
@@ -178,7 +190,8 @@ def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK
 
     Args:
         window: Weights of SSIM's window, float32. (TAPS,)
-        maps: Products that `rows_kernel` blurred along rows, float32. (n, 4, H, W)
+        maps: Result of `rows_kernel`: p, t, p^2 + t^2 and p t, blurred along rows, float32.
+            (n, 4, H, W)
         slopes: Output for the derivatives, float32. (n, 3, H, W)
         height: Rows H of the masks.
         width: Columns W of the masks.
@@ -197,6 +210,7 @@ def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK
     ssim = top_mean * top_cov * scale
     change = t * (top_cov - top_mean) + p * ssim * (low_mean - low_var)
     out = slopes + n * 3 * pixels + index
+    # Derivatives with respect to the blurred p, p^2 and p t.
     tl.store(out, 2 * change * scale, mask=index < pixels)
     tl.store(out + pixels, -ssim * scale * low_mean, mask=index < pixels)
     tl.store(out + 2 * pixels, 2 * top_mean * scale, mask=index < pixels)
@@ -206,7 +220,10 @@ def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK
 def slope_rows_kernel(
     window, slopes, blurred, height, width, TAPS: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Blur derivatives along rows. The grid of programs is (blocks, n * 3).
+    """Blur derivatives along rows.
+
+    Each of the three maps of derivatives counts as an instance, so the grid of programs is
+    (blocks, n * 3).
 
     Args:
         window: Weights of SSIM's window, float32. (TAPS,)
@@ -219,13 +236,13 @@ def slope_rows_kernel(
     """
     n, pixels, index = _block(height, width, BLOCK=BLOCK)
     col = index % width
-    total = tl.zeros((BLOCK,), dtype=tl.float32)
+    blur = tl.zeros((BLOCK,), dtype=tl.float32)
     for tap in tl.static_range(TAPS):
         shift = tap - TAPS // 2
         inside = (index < pixels) & (col + shift >= 0) & (col + shift < width)
         slope = tl.load(slopes + n * pixels + index + shift, mask=inside, other=0.0)
-        total += tl.load(window + tap) * slope
-    tl.store(blurred + n * pixels + index, total, mask=index < pixels)
+        blur += tl.load(window + tap) * slope
+    tl.store(blurred + n * pixels + index, blur, mask=index < pixels)
 
 
 @triton.jit
@@ -245,7 +262,8 @@ def gradient_kernel(
     """Blur derivatives along columns and compute the gradient of the predicted masks.
 
     Args:
-        grads: Gradient of the sums, float32. (n, 7)
+        grads: Gradient of the sums, float32. Only the first three sums have a gradient with
+            respect to the predicted masks, so the last four entries are not used. (n, 7)
         preds: Predicted masks p in [0, 1], float32. (n, H, W)
         targets: Ground-truth masks t in [0, 1], float32. (n, H, W)
         window: Weights of SSIM's window, float32. (TAPS,)
@@ -270,17 +288,18 @@ def gradient_kernel(
     )
     p = tl.load(preds + n * pixels + index, mask=index < pixels, other=0.0)
     t = tl.load(targets + n * pixels + index, mask=index < pixels, other=0.0)
-    sign = (p > t).to(tl.float32) - (p < t).to(tl.float32)
-    # Gradient of the sums of w |p - t| and w p, without the factor w.
+    sign = (p > t).to(tl.float32) - (p < t).to(tl.float32)  # derivative of |p - t|
+    # Gradient from the sums of w |p - t| and w p, without the factor w, which follows below.
     slope = tl.load(grads + n * 7) * sign + tl.load(grads + n * 7 + 1)
     # Chain rule for SSIM, from the gradients with respect to p, p^2 and p t.
     ssim_slope = by_mean + 2 * p * by_square + t * by_product
-    total = (1 + (weight - 1) * t) * slope - tl.load(grads + n * 7 + 2) * ssim_slope
-    tl.store(out + n * pixels + index, total, mask=index < pixels)
+    # The third sum contains 1 - SSIM, hence the minus.
+    gradient = (1 + (weight - 1) * t) * slope - tl.load(grads + n * 7 + 2) * ssim_slope
+    tl.store(out + n * pixels + index, gradient, mask=index < pixels)
 
 
 def _blur_products(preds, targets, window):
-    """Blur p, t, p^2 + t^2 and p t along rows. (n, H, W), (n, H, W), (size,) -> (n, 4, H, W)"""
+    """Run `rows_kernel`. (n, H, W), (n, H, W), (size,) -> (n, 4, H, W)"""
     instances, height, width = preds.shape
     maps = torch.empty(instances, 4, height, width, dtype=torch.float32, device=preds.device)
     rows_kernel[_num_blocks(preds), instances](
@@ -303,7 +322,11 @@ def _num_blocks(masks):
 
 
 def raster_loss_sums(preds, targets, window, weight):
-    """Compute the sums of `raster_loss_sums_reference`.
+    """Compute the sums of `raster_loss_sums_reference`, with the window given as weights.
+
+    With w = 1 + (weight - 1) t, these are the sums of w |p - t|, w p, 1 - SSIM, w t and w - 1, the
+    number of pixels with any part of the target in their window, and the number of pixels whose
+    window covers the target or the prediction by more than `MIN_COVERAGE`.
 
     Args:
         preds: Predicted masks in [0, 1], float32. (n, H, W)
@@ -321,7 +344,7 @@ def raster_loss_sums(preds, targets, window, weight):
     instances, height, width = preds.shape
     blocks = _num_blocks(preds)
     sums = torch.empty(instances, blocks, 7, dtype=torch.float32, device=preds.device)
-    with torch.cuda.device_of(preds):
+    with torch.cuda.device_of(preds):  # kernels run on the current device
         sums_kernel[blocks, instances](
             preds,
             targets,
@@ -335,7 +358,7 @@ def raster_loss_sums(preds, targets, window, weight):
             BLOCK=BLOCK,
             **EXACT_OPTIONS,
         )
-    return sums.sum(1)
+    return sums.sum(1)  # over the blocks, in a fixed order
 
 
 def raster_loss_sums_backward(grads, preds, targets, window, weight):
@@ -349,7 +372,8 @@ def raster_loss_sums_backward(grads, preds, targets, window, weight):
         weight: Weight of a foreground pixel, relative to a background pixel.
 
     Returns:
-        Tuple with one entry, the gradient of the predicted masks, float32. (n, H, W)
+        Tuple with one entry, the gradient of the predicted masks, float32 (n, H, W). The other
+        inputs have no gradient.
     """
     preds = preds.contiguous()
     targets = targets.contiguous()
@@ -363,7 +387,8 @@ def raster_loss_sums_backward(grads, preds, targets, window, weight):
     with torch.cuda.device_of(preds):
         maps = _blur_products(preds, targets, window=window)
         slopes_kernel[blocks, instances](window, maps, slopes=slopes, **sizes, **OPTIONS)
-        # The maps are not needed any more, so the next kernel writes its output to their memory.
+        # The maps are not needed any more, so the next kernel writes its output to their memory. It
+        # takes three of the four maps per instance.
         blurred = maps.view(-1)[: slopes.numel()]
         slope_rows_kernel[blocks, 3 * instances](
             window, slopes, blurred=blurred, **sizes, **OPTIONS

@@ -8,6 +8,7 @@ from gsmap.ops.soft_iou.reference import pairwise_minima_reference
 from gsmap.utils.errors import InputError
 
 _EPS = 1e-6  # added to the union, so that two empty masks have IoU 0
+# Operator that calls a fused kernel of this folder: sums of minima (N, K), without gradient.
 _pairwise_minima = fused_operator(
     "soft_iou.pairwise_minima",
     "Tensor preds, Tensor targets",
@@ -25,7 +26,8 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
     Args:
         preds: Predicted masks in [0, 1]. (N, H, W)
         targets: Ground-truth masks in [0, 1]. (K, H, W)
-        backend: Backend, see `choose_backend`. The fused kernels have no gradient, so ``"auto"``
+        backend: ``"auto"``, ``"reference"`` (plain torch), ``"cpu"`` (numba) or ``"triton"``, see
+            `choose_backend`. The last two are fused kernels without a gradient, so ``"auto"``
             selects them only if no gradient is needed.
 
     Returns:
@@ -41,7 +43,7 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
             "preds and targets must have shapes (N, H, W) and (K, H, W), "
             f"got {tuple(preds.shape)} and {tuple(targets.shape)}."
         )
-    dtype = torch.promote_types(preds.dtype, torch.float32)
+    dtype = torch.promote_types(preds.dtype, torch.float32)  # half precision becomes float32
     preds = preds.to(dtype).flatten(1)  # (N, HW)
     targets = targets.to(dtype).flatten(1)  # (K, HW)
     wants_gradient = torch.is_grad_enabled() and (preds.requires_grad or targets.requires_grad)

@@ -1,4 +1,8 @@
-"""Tables and curves of results on the report page."""
+"""Tables and curves of results on the report page.
+
+Figures are the values of `MetricReport.metrics`, by flat keys such as ``chamfer/divider/AP@0.5``. A
+figure that does not exist has the value ``UNDEFINED``.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,7 +30,8 @@ from gsmap.visualization.page.scores import ScoredResult
 from gsmap.visualization.style import MapStyle
 
 Table = dict[str, Any]
-_MAX_CURVE_POINTS = 120
+"""Title (``caption``), headings of the columns (``head``) and cells of each row (``rows``)."""
+_MAX_CURVE_POINTS = 120  # largest number of points of a precision-recall curve
 _MAX_DIFFERENCES = 12  # samples in the table of differences
 _UNITS = {"chamfer": "m", "raster": "IoU"}  # units of thresholds
 
@@ -47,7 +52,7 @@ def summary_table(results: Sequence[ScoredResult], resamples: Resamples | None =
         Table with a column per result.
     """
     head = ["mean over classes"]
-    columns = []  # values and intervals of each result
+    columns = []  # figures and intervals of each result, by flat key
     for result in results:
         intervals: Mapping[str, Interval] = {}
         if resamples is not None:
@@ -115,7 +120,7 @@ def difference_table(
         Table with a row per sample.
     """
     first_result, second_result = results
-    f1_of_samples = []
+    f1_of_samples = []  # token, F1 of the first result, F1 of the second result
     for token in titles:
         first = first_result.f1(token, score_thr)
         second = second_result.f1(token, score_thr)
@@ -138,21 +143,26 @@ def difference_table(
 
 
 def _columns(report: MetricReport, class_name: str) -> list[tuple[str, str, float, int]]:
-    """Heading, metric key, factor and digits of each column of a table of classes."""
+    """Heading, metric key, factor and digits of each column of a table of classes.
+
+    The key is the end of a flat key, after the names of the metric and the class. The figure is
+    multiplied by the factor, 100 for percent, and shown with the number of decimal digits.
+    """
     thresholds = report.detections[class_name].thresholds
     unit = _UNITS[report.name]
+    # Thresholds are ascending. The loosest one is the largest distance, or the smallest IoU.
     if report.name == "chamfer":
         loosest = thresholds[-1]
-        error = ("mean error (m)", f"error_m@{loosest}", 1, 2)
+        match_quality = ("mean error (m)", f"error_m@{loosest}", 1, 2)
     else:
         loosest = thresholds[0]
-        error = ("mIoU", "mIoU", 1, 3)
+        match_quality = ("mIoU", "mIoU", 1, 3)
     ap_columns = [(f"at {value} {unit}", f"AP@{value}", 100, 1) for value in thresholds]
     return [
         ("AP (%)", "AP", 100, 1),
         *ap_columns,
         (f"recall at {loosest} {unit} (%)", f"recall@{loosest}", 100, 1),
-        error,
+        match_quality,
         (f"calibration error at {loosest} {unit}", f"calibration_error@{loosest}", 1, 3),
         ("truths", "num_gts", 1, 0),
         ("predictions", "num_preds", 1, 0),
@@ -172,6 +182,7 @@ def class_tables(results: Sequence[ScoredResult], style: MapStyle) -> list[Table
     tables = []
     has_several = len(results) > 1
     for index, report in enumerate(results[0].reports):
+        # The classes of a group have common thresholds, so they fit in one table.
         for group, names in report.groups.items():
             columns = _columns(report, names[0])
             rows = []
@@ -201,7 +212,8 @@ def curves(results: Sequence[ScoredResult], style: MapStyle) -> list[dict[str, A
         style: Class names.
 
     Returns:
-        Panels with the AP and the points (recall, precision) of each result.
+        Panels. Each line has lists of the AP and of the points (recall, precision), with an entry
+        per result.
     """
     panels = []
     for index, report in enumerate(results[0].reports):
@@ -212,9 +224,9 @@ def curves(results: Sequence[ScoredResult], style: MapStyle) -> list[dict[str, A
                 key = f"{report.name}/{name}/AP@{threshold}"
                 aps = []
                 points = []
-                for each in reports:
-                    aps.append(_format_value(each.metrics[key]))
-                    points.append(_curve_points(each.detections[name], column))
+                for result_report in reports:
+                    aps.append(_format_value(result_report.metrics[key]))
+                    points.append(_curve_points(result_report.detections[name], column))
                 label = f"{threshold} {_UNITS[report.name]}"
                 lines.append({"label": label, "ap": aps, "points": points})
             class_index = style.classes.index(name)
@@ -242,7 +254,7 @@ def reliability_curves(
     vertices_of_results = [
         _matched_vertices(result, truth=truth, style=style) for result in results
     ]
-    laws: dict[str, None] = {}  # an ordered set
+    laws: dict[str, None] = {}  # keys only: a set in the order of the results
     for result, vertices in zip(results, vertices_of_results, strict=True):
         if vertices:
             laws[result.law] = None
@@ -271,7 +283,7 @@ def _reliability(
     """Measure the reliability of one class in one direction.
 
     Args:
-        law: Distribution of the errors.
+        law: Distribution of the errors, ``normal`` or ``laplace``.
         vertices: Matched vertices of a result, or None.
         label: Index of the class.
         axis: Index of the direction in ``AXES``.
@@ -287,9 +299,10 @@ def _reliability(
         return UNDEFINED, []
     errors = of_class.errors[:, axis]
     sigmas = of_class.sigmas[:, axis]
-    one_sigma_level = COVERED[0]  # 68.3 %
-    half_width = half_widths(law, [one_sigma_level])[0]
+    one_sigma_level = COVERED[0]  # probability of the interval of one sigma of a normal law, 68.3 %
+    half_width = half_widths(law, [one_sigma_level])[0]  # in units of sigma
     share = float((errors <= half_width * sigmas).mean())
+    # `reliability` returns the share of errors in the central interval of each of ``LEVELS``.
     points = np.stack([LEVELS, reliability(errors, sigmas, law)], axis=1)
     return share, points.round(3).tolist()
 
@@ -301,6 +314,7 @@ def _matched_vertices(
     for elements in result.predictions.values():
         if len(elements) and elements.scales is None:
             return None
+    # Without a match, `matched_vertices` would raise an error.
     has_match = any((matches.matched_gt >= 0).any() for matches in result.matches.values())
     if not has_match:
         return None
@@ -318,7 +332,7 @@ def group_tables(results: Sequence[ScoredResult], groups: Groups, by: str) -> li
     Args:
         results: One or two results.
         groups: Groups of the samples.
-        by: Name of the grouping, for the caption.
+        by: Name of the grouping for the caption, such as ``scene``.
 
     Returns:
         Tables in the order of the results.
