@@ -5,8 +5,9 @@ import sys
 
 from gsmap.utils.cli import CommandParser, run_command
 
-# Module of each command. Only the module of the requested command is imported, as the libraries of
-# other commands would add to the measured memory.
+# Module of each command, in this package. A module has `add_arguments(parser)` and `run(args)`, and
+# its docstring is the help text. Only the module of the requested command is imported, as the
+# libraries of other commands would add to the measured memory.
 COMMANDS = {
     "data": "data_commands",
     "eval": "evaluation",

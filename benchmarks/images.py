@@ -18,17 +18,19 @@ import gsmap.registered  # noqa: F401
 from gsmap.utils.errors import InputError
 
 _CAMERAS = 6
+# Steps of the pipelines. By default, images are converted to float32 directly after loading. With
+# ``on_device``, they stay in uint8, and the later image steps are only recorded for the GPU.
 _LOAD = {"type": "LoadCameraImages"}
-_BYTES = {**_LOAD, "to_float32": False}
-_ON_DEVICE = {**_LOAD, "on_device": True}
+_LOAD_UINT8 = {**_LOAD, "to_float32": False}
+_LOAD_ON_DEVICE = {**_LOAD, "on_device": True}
 _DISTORT = {"type": "DistortImages"}
 _SCALE = {"type": "ScaleImages", "scale": 0.5}
 _PACK = {"type": "PackMapInputs"}
 PIPELINES = {
-    "train": [_BYTES, _DISTORT, _SCALE, _PACK],
-    "train, images_on_device": [_ON_DEVICE, _DISTORT, _SCALE, _PACK],
+    "train": [_LOAD_UINT8, _DISTORT, _SCALE, _PACK],
+    "train, images_on_device": [_LOAD_ON_DEVICE, _DISTORT, _SCALE, _PACK],
     "test": [_LOAD, _SCALE, _PACK],
-    "test, images_on_device": [_ON_DEVICE, _SCALE, _PACK],
+    "test, images_on_device": [_LOAD_ON_DEVICE, _SCALE, _PACK],
 }
 
 
@@ -36,7 +38,7 @@ class Frames(Dataset):
     """Data set that passes one frame of six images through a pipeline again and again.
 
     Args:
-        files: Image files.
+        files: Image files, one for each camera.
         pipeline: Key of ``PIPELINES``.
         count: Number of samples.
     """
@@ -53,6 +55,7 @@ class Frames(Dataset):
     def __getitem__(self, row: int) -> Any:
         cameras = {}
         for file in self.files:
+            # The time of the steps does not depend on the values of the calibration.
             camera = {"img_path": str(file), "cam2img": np.eye(4), "lidar2cam": np.eye(4)}
             cameras[file.stem] = camera
         return self.pipeline({"images": cameras, "token": str(row), "cam_names": list(cameras)})
@@ -80,6 +83,7 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg"))
     if len(files) < _CAMERAS:
         raise InputError(f"{folder} has {len(files)} JPEG files: give a folder of six or more.")
+    # Let OpenCV and torch use one thread, so that processor time is the time of one process.
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
     result = {}
@@ -91,11 +95,11 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
         for row in range(count):
             frames[row]
         result[f"{name}, ms a sample"] = 1e3 * (time.process_time() - start) / count
-    for number in workers:
+    for num_workers in workers:
         for name in ("train", "train, images_on_device"):
-            frames = Frames(files[:_CAMERAS], name, count=count * number)
-            rate = _samples_per_second(frames, number)
-            result[f"{name}, samples/s, {number} workers"] = rate
+            frames = Frames(files[:_CAMERAS], name, count=count * num_workers)
+            rate = _samples_per_second(frames, num_workers)
+            result[f"{name}, samples/s, {num_workers} workers"] = rate
     return result
 
 
@@ -110,9 +114,9 @@ def _samples_per_second(frames: Frames, workers: int) -> float:
     )
     num_samples = 0
     start = 0.0
-    for number, batch in enumerate(loader, start=1):
-        if number == workers:  # workers return batches in turn, so each has returned one
+    for num_batches, batch in enumerate(loader, start=1):
+        if num_batches == workers:  # workers return batches in turn, so each has returned one
             start = time.perf_counter()
-        elif number > workers:
+        elif num_batches > workers:
             num_samples += len(batch["data_samples"])
     return num_samples / (time.perf_counter() - start)

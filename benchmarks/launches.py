@@ -4,8 +4,9 @@ They are counted for the prediction of a frame and for a training step, and sepa
 part of the program (`PARTS`). A launch takes about 20 microseconds of the host, and the GPU is idle
 during a wait. The numbers do not depend on the size of the images. A training step is mmengine's,
 with optimizer, gradient clipping and the collection of figures (losses and statistics) for the
-log. The backward pass of a part is listed as ``backward:`` and its name. See
-`benchmarks.pretended_gpu`.
+log. The backward pass of a part is listed as ``backward:`` and its name. The counts are made by
+`benchmarks.pretended_gpu`, a device of torch that computes on the CPU and counts the launches and
+waits that a GPU would have.
 """
 
 import argparse
@@ -26,8 +27,9 @@ from gsmap.engine.figures import keep_figures
 from gsmap.engine.launch import read_config
 from gsmap.utils.errors import WorkError
 
-# Parts of the program that are counted separately: attribute of the detector (empty for the
-# detector itself), name of the attribute's method, and name of the part.
+# Methods whose launches are counted separately: attribute of the detector with the method (empty
+# for a method of the detector itself), name of the method, and name of the part. Several methods
+# may belong to one part. Methods that a model does not have are left out.
 PARTS = (
     ("data_preprocessor", "forward", "preprocessor"),
     ("", "extract_img_feats", "backbone, neck"),
@@ -100,7 +102,8 @@ class Trial:
         self.model, inputs, self.samples = models.model_and_batch(config, options, batch=batch)
         self.inputs: dict[str, Any] = {}
         if self.model.bev_encoder is not None:
-            # Undo the normalization, approximately.
+            # The model normalizes its images itself, but these are normalized already. So the
+            # normalization is undone, approximately.
             pixels = (inputs["imgs"] * 50 + 120).clamp(0, 255).to(torch.uint8)
             self.inputs["img"] = list(pixels)
         if self.model.lidar_encoder is not None:
@@ -121,11 +124,11 @@ class Trial:
             self.model.init_weights()  # after the move to the device, as in mmengine
             self.wrapper = build_optim_wrapper(self.model, self.settings)
         self.model.train()
-        models.advance_samples(self.samples)
+        models.advance_samples(self.samples)  # the next frame of each stream, for temporal models
         self.gpu.clear()
         with self._count_parts():
             figures = self.model.train_step(self._data(self.samples), self.wrapper)
-            with self.gpu.part("figures"):
+            with self.gpu.part("figures"):  # the runner's hook stores them for the log in this way
                 prefixed = {f"train/{name}": value for name, value in figures.items()}
                 keep_figures(self.wrapper.message_hub, prefixed)
         return figures
@@ -143,7 +146,8 @@ class Trial:
         self.model.eval()
         models.advance_samples(self.samples)
         sample = self.samples[0].clone()
-        for name in sample.keys():  # noqa: SIM118  samples of a test pipeline have no targets
+        # Samples of a test pipeline have no targets, which are all of the fields that `keys` lists.
+        for name in sample.keys():  # noqa: SIM118
             delattr(sample, name)
         self.gpu.clear()
         with self._count_parts():
@@ -207,7 +211,10 @@ def _run_inside(
 
 
 def _table(gpu: PretendedGPU, with_waits: bool) -> str:
-    """Format the counts by part, and the lines that cause waits if ``with_waits``."""
+    """Format the counts by part, and the lines that cause waits if ``with_waits``.
+
+    Work outside of all parts has an empty name, and is listed as ``rest``.
+    """
     launches: Counter[str] = Counter()
     waits: Counter[str] = Counter()
     names_by_part: dict[str, Counter[str]] = {}

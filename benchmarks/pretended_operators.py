@@ -48,7 +48,7 @@ WAITS = {
     aten.unique_dim.default,
     aten._linalg_check_errors.default,
 }
-# Operations whose result is a Python number or bool.
+# Operations whose result is a Python number or bool, not a tensor of the pretended GPU.
 READS = {aten._local_scalar_dense.default, aten.is_nonzero.default, aten.equal.default}
 # Operations whose second argument is a list of indices, which may be on the CPU.
 INDEXING = {
@@ -71,7 +71,9 @@ def _attention_weights(query: Tensor, key: Tensor, bias: Tensor | None, scale: f
 def _efficient_attention(
     query: Tensor, key: Tensor, value: Tensor, bias: Tensor | None, *_: Any, **options: Any
 ) -> tuple[Tensor, ...]:
-    """Compute attention with matrix products, without dropout.
+    """Compute attention with matrix products, without dropout and without a causal mask.
+
+    The operation also takes the settings of these two; they are ignored.
 
     Args:
         query: Queries. (B, heads, N, C)
@@ -82,14 +84,16 @@ def _efficient_attention(
 
     Returns:
         Weighted sums of the values (B, heads, N, C), and zeros in place of the three other results
-        of the GPU's kernel: the log-sums of the softmax and the state of the random generator.
+        of the GPU's kernel: the log-sums of the softmax, and the seed and the offset of the random
+        generator.
     """
     scale = options.get("scale") or query.shape[-1] ** -0.5
     weights = _attention_weights(query.float(), key.float(), bias=bias, scale=scale)
     result = (weights @ value.float()).to(query.dtype)
     log_sums = query.new_zeros(query.shape[:3], dtype=torch.float32)
     seed = torch.zeros((), dtype=torch.long)
-    return result, log_sums, seed, seed.clone()
+    offset = torch.zeros((), dtype=torch.long)
+    return result, log_sums, seed, offset
 
 
 def _efficient_attention_backward(
@@ -102,6 +106,8 @@ def _efficient_attention_backward(
     **options: Any,
 ) -> tuple[Tensor, ...]:
     """Compute the gradients of `_efficient_attention`. The gradient of the bias is set to 0.
+
+    The operation also takes the results of the forward pass; they are ignored and computed again.
 
     Args:
         grad: Gradient of the result. (B, heads, N, C)
@@ -159,7 +165,7 @@ def _sample_kernels(
 
 
 # References of the project's operators without a kernel for the CPU, by the name of the operator.
-# They are differentiable in their first three tensors.
+# Their first three arguments are the tensors that have gradients.
 _REFERENCES: dict[str, Callable[..., Tensor]] = {
     "deformable_sample": _sample_deformably,
     "sample_kernels": _sample_kernels,
@@ -170,7 +176,7 @@ def run_cpu_kernel(name: str, args: Any) -> Any:
     """Compute one of the project's operators by its kernel for the CPU or by its reference.
 
     Args:
-        name: Name of the operator, with ``gsmap.``.
+        name: Name of the operator, with the prefix ``gsmap.``.
         args: Arguments on the CPU; the last one is the backend.
 
     Returns:
@@ -189,8 +195,10 @@ def run_cpu_kernel(name: str, args: Any) -> Any:
     upstream, *inputs = inputs
 
     def gradients() -> list[Tensor]:
+        # The inputs are detached above, so that the tensors of the caller are not changed.
         leaves = [tensor.requires_grad_() for tensor in inputs[:3]]
         result = reference(*leaves, *inputs[3:])
+        # An input without influence on the result gets a gradient of zeros instead of None.
         grads = torch.autograd.grad(result, leaves, grad_outputs=upstream, materialize_grads=True)
         return list(grads)
 

@@ -19,10 +19,11 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import clip_to_box
 
-GRID = BEVGrid((-15, 15), (-30, 30), 200, 100)
-SETTINGS = PriorSettings(("divider", "boundary"), "benchmark")
+GRID = BEVGrid((-15, 15), (-30, 30), height=200, width=100)  # range of a frame in metres
+SETTINGS = PriorSettings(("divider", "boundary"), place="benchmark")
+# Rules by which a frame changes the cells of a raster: each gives a prior to compare.
 RULES: tuple[WriteRule, ...] = (KeepMaximum(), LastSeen(), HitMissCounts())
-PASSES = 3
+PASSES = 3  # drives along the road
 STEP_M = 5.0  # distance between frames
 NOISE_M = 0.25  # standard deviation of the error of a predicted line, across its direction
 MISSED = 0.15  # share of the true lines that a frame does not predict
@@ -50,7 +51,10 @@ def road(distance_m: NDArray[np.float64], offset_m: float) -> NDArray[np.float64
 
 
 def true_lines(length_m: float) -> list[tuple[NDArray[np.float64], int]]:
-    """Lines of the road in the global frame, with their classes."""
+    """Lines of the road in the global frame, with their classes.
+
+    They extend beyond both ends of the drives, so that they fill the range of every frame.
+    """
     distances_m = np.arange(-60.0, length_m + 60.0, 1.0)
     return [(road(distances_m, offset_m), label) for offset_m, label in _LINES]
 
@@ -62,6 +66,7 @@ def pose_on_road(distance_m: float, beside_m: float) -> NDArray[np.float64]:
         distance_m: Position along the road, in metres.
         beside_m: Distance from the middle of the road, positive to the right.
     """
+    # Angle of the road from the y axis: the road runs along (slope, 1), as in `road`.
     yaw_rad = -math.atan(0.3 * math.sin(distance_m / 300))
     cos = math.cos(yaw_rad)
     sin = math.sin(yaw_rad)
@@ -83,6 +88,7 @@ def elements_in_range(
     pieces = []
     labels = []
     for line, label in lines:
+        # Points farther away are outside of the range of the frame.
         is_near = np.abs(line - pose[:2, 3]).max(axis=1) < 60
         # The product of row vectors with a rotation matrix is the inverse rotation.
         local = (line[is_near] - pose[:2, 3]) @ pose[:2, :2]
@@ -112,9 +118,11 @@ def predict(truth: MapElements, rng: np.random.Generator) -> MapElements:
         phase = rng.uniform(0, 2 * math.pi)
         bend = math.sqrt(2) * np.sin(np.linspace(0, 6, _NUM_POINTS) + phase)
         shift = NOISE_M * (rng.normal() + bend) / math.sqrt(2)
+        # Lines run nearly along y, so a shift along x is an error across the line.
         lines.append(np.stack([x + shift, y], axis=1))
         labels.append(label)
     for _ in range(rng.poisson(FALSE)):
+        # A false line is straight, about 15 m long, and of a random class.
         start = np.array([rng.uniform(-12, 12), rng.uniform(-30, 15)])
         step = np.array([rng.normal(), 15.0])
         lines.append(np.stack([start, start + step]))
@@ -129,6 +137,7 @@ def drives(length_m: float) -> list[Frame]:
     frames = []
     for number in range(PASSES):
         for distance_m in np.arange(0.0, length_m, STEP_M).tolist():
+            # Drive i starts i metres along the road, so its frames lie at other places.
             pose = pose_on_road(distance_m + number, beside_m=rng.normal())
             truth = elements_in_range(lines, pose)
             frames.append((pose, predict(truth, rng)))
@@ -170,7 +179,7 @@ def compare(length_km: float) -> str:
             return raster.read(pose, GRID)  # noqa: B023 - called in this iteration
 
         figures = _figures(frames, lines, write=write_raster, read=read_raster, save=raster.save)
-        rows.append([type(rule).__name__, *figures, "-"])
+        rows.append([type(rule).__name__, *figures, "-"])  # rasters have no sigmas
     prior = GaussianPrior(SETTINGS)
     figures = _figures(
         frames,
@@ -216,30 +225,30 @@ def _figures(
     for pose, elements in frames:
         write(pose, elements)
     write_s = time.process_time() - start_s
-    num_frames = len(frames) // PASSES
+    frames_per_drive = len(frames) // PASSES
     read_s = 0.0
     thresholds = np.arange(1, 10) / 10
     intersections = np.zeros(len(thresholds))
     unions = np.zeros(len(thresholds))
-    for pose, _ in frames[-num_frames:]:
+    for pose, _ in frames[-frames_per_drive:]:
         start_s = time.process_time()
         values = read(pose)
         read_s += time.process_time() - start_s
         truth = draw(elements_in_range(lines, pose)) >= 0.5
         for index, threshold in enumerate(thresholds.tolist()):
-            found = values >= threshold
-            intersections[index] += int((found & truth).sum())
-            unions[index] += int((found | truth).sum())
+            is_predicted = values >= threshold
+            intersections[index] += int((is_predicted & truth).sum())
+            unions[index] += int((is_predicted | truth).sum())
     iou = intersections / np.maximum(unions, 1)
     best = int(iou.argmax())
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "prior"
         save(path)
         size_mb = path.stat().st_size / 1e6
-    length_km = num_frames * STEP_M / 1000
+    length_km = frames_per_drive * STEP_M / 1000
     return [
         f"{1e3 * write_s / len(frames):.2f}",
-        f"{1e3 * read_s / num_frames:.2f}",
+        f"{1e3 * read_s / frames_per_drive:.2f}",
         f"{1000 * size_mb / length_km:.0f}",
         f"{iou[best]:.3f} at {thresholds[best]:.1f}",
     ]
@@ -266,7 +275,7 @@ def _share_within_2_sigma(prior: GaussianPrior, length_m: float) -> float:
                 line = road(distances_m, offset_m)
                 nearest = np.abs(line[:, 1] - means[:, 1, None]).argmin(axis=1)
                 errors = np.minimum(errors, np.abs(line[nearest, 0] - means[:, 0]))
-        is_near = errors < 1.5
+        is_near = errors < 1.5  # metres; Gaussians farther away are of false lines
         num_near += int(is_near.sum())
         num_within += int((errors <= 2 * sigmas)[is_near].sum())
     return num_within / max(num_near, 1)

@@ -41,22 +41,25 @@ def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], tupl
         args: Parsed options of ``add_arguments``.
 
     Returns:
-        Shortest time of every part in seconds; and the number of cameras, image rows and columns.
+        Shortest time in seconds of every part: ``image backbone``, ``image neck`` (if the model has
+        one), ``BEV encoder`` and ``map head``; and the number of cameras, image rows and columns.
     """
     model, inputs, samples = model_and_batch(path, args)
     model.eval()
     cameras, _, height, width = inputs["imgs"][0].shape
+    # The BEV encoder reads the size of the padded images from the metainfo.
     samples[0].set_metainfo({"batch_input_shape": (height, width)})
+    # The V images of the only sample (V, 3, H, W), in the memory format that the model uses.
     images = inputs["imgs"][0].contiguous(memory_format=torch.channels_last)
     on_gpu = args.device != "cpu"
     clock = time.perf_counter if on_gpu else time.process_time
     times: dict[str, list[float]] = {}
 
-    def time_part(part: str, function: Callable[..., Any], *inputs: Any) -> Any:
+    def time_part(part: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function, note its time, and return its result."""
         start = clock()
-        result = function(*inputs)
-        if on_gpu:
+        result = function(*arguments)
+        if on_gpu:  # the GPU may still work when the function returns
             torch.cuda.synchronize()
         times.setdefault(part, []).append(clock() - start)
         return result
@@ -72,5 +75,5 @@ def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], tupl
             bev = time_part("BEV encoder", model.bev_encoder, feats, [samples[0].metainfo])
             time_part("map head", model.map_head.predict, bev, samples)
     # The first repeat is a warm-up, which does not count.
-    shortest = {part: min(values[1:]) for part, values in times.items()}
+    shortest = {part: min(seconds[1:]) for part, seconds in times.items()}
     return shortest, (cameras, height, width)

@@ -53,11 +53,11 @@ def run(args: argparse.Namespace) -> None:
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     clock = "wall clock" if args.device != "cpu" else "processor time, all threads together"
-    where = f"{args.device}, {args.threads} threads, torch {torch.__version__}; {clock}"
+    setup = f"{args.device}, {args.threads} threads, torch {torch.__version__}; {clock}"
     parts = [
-        f"Rendering {args.instances} x {POINTS} Gaussians, forward + backward ({where}):\n",
+        f"Rendering {args.instances} x {POINTS} Gaussians, forward + backward ({setup}):\n",
         rendering_table(args),
-        f"\nThe rest of the training path at {TRAINING_SIZE[0]} x {TRAINING_SIZE[1]} ({where}):\n",
+        f"\nThe rest of the training path at {TRAINING_SIZE[0]} x {TRAINING_SIZE[1]} ({setup}):\n",
         training_table(args),
     ]
     publish("\n".join(parts), args.out)
@@ -74,6 +74,8 @@ def random_polylines(count: int, grid: BEVGrid) -> Tensor:
         Vertices in metres. (count, 20, 2)
     """
     width_m, height_m = grid.extent_m
+    # The lines run along y for 20 steps of 1.5 m on average, half the height of the map. With the
+    # shift by 3/4 of the height, their middles are spread over the map.
     steps = torch.randn(count, POINTS, 2) * 0.3 + torch.tensor([0.2, 1.5])
     starts = torch.rand(count, 1, 2) * torch.tensor([width_m, height_m])
     return starts + steps.cumsum(1) - torch.tensor([width_m / 2, height_m * 0.75])
@@ -100,7 +102,8 @@ def forward_backward(
 
     Args:
         render: Differentiable function of the inputs.
-        inputs: Inputs, moved to the device of ``upstream``.
+        inputs: Inputs, moved to the device of ``upstream``. An input that is already there is
+            changed: it requires a gradient afterwards.
         upstream: Gradient of the result, in the shape of the result.
 
     Returns:
@@ -130,7 +133,7 @@ def ellipse_pixels(gaussians: Gaussians, grid: BEVGrid) -> int:
 
 def byte_seconds(device: torch.device) -> float:
     """Measure the seconds to write a byte to new memory and to read it again."""
-    # Number of values, of four bytes each.
+    # Number of float32 values, four bytes each.
     size = 8 * MIB if device.type == "cpu" else 512 * MIB  # far beyond a GPU's cache
     data = torch.ones(size, device=device)
 
@@ -162,6 +165,7 @@ def exponential_seconds(device: torch.device) -> float:
                 out[k] = exp2_float32(values[k])
         return out
 
+    # Exponents of densities are negative. The 4096 values stay in the cache during the 256 rounds.
     array = -torch.rand(1 << 12).numpy()
     cost = measure(lambda: fill_exponentials(array, 256), device, repeats=RATE_REPEATS)
     return cost.cpu_s / (256 * len(array))
@@ -186,21 +190,23 @@ def rendering_table(args: argparse.Namespace) -> str:
         lines = random_polylines(args.instances, grid)
         upstream = torch.randn(args.instances, height, width, device=device)
         soft_lines = measure_soft_lines(lines, grid, upstream=upstream, repeats=args.repeats)
+        # Number of instances of the reference, and factor by which its cost is scaled up.
         count = min(args.instances, math.ceil(REFERENCE_BYTES / (4 * POINTS * height * width)))
         factor = args.instances / count
         for scales_m in SCALES_M:
             gaussians = gaussians_along(lines, scales_m)
             means, scales, rotations = gaussians
-            few = (means[:count], scales[:count], rotations[:count])
+            reference_gaussians = (means[:count], scales[:count], rotations[:count])
             reference = measure_renderer(
-                few, grid, upstream=upstream, backend="reference", repeats=2
+                reference_gaussians, grid, upstream=upstream, backend="reference", repeats=2
             )
             fused = measure_renderer(
                 gaussians, grid, upstream=upstream, backend=backend, repeats=args.repeats
             )
-            pixels = ellipse_pixels(few, grid) * factor
+            pixels = ellipse_pixels(reference_gaussians, grid) * factor
             # Any renderer writes the masks once and reads their gradients once. It computes two
-            # exponentials per pixel, one in the forward and one in the backward pass.
+            # exponentials per pixel, one in the forward and one in the backward pass. A value of a
+            # mask has 4 bytes, and `per_byte_s` includes writing and reading.
             floor_s = 4 * upstream.numel() * per_byte_s + 2 * pixels * per_exponential_s
             cells = rendering_cells(
                 reference=reference.scale(factor),
@@ -321,7 +327,8 @@ def training_table(args: argparse.Namespace) -> str:
     device = torch.device(args.device)
     height, width = TRAINING_SIZE
     grid = BEVGrid((-15, 15), (-30, 30), height=height, width=width)
-    num_matched = args.instances // 4  # one of the 4 samples of the batch, in all decoder layers
+    # Matched instances of one of the 4 samples of the batch, in all decoder layers.
+    num_matched = args.instances // 4
     num_truths = min(15, num_matched)
     lines = random_polylines(num_matched, grid).to(device)
     targets = draw_polylines(lines, grid)
@@ -338,6 +345,7 @@ def training_table(args: argparse.Namespace) -> str:
         def loss(masks: Tensor) -> Tensor:
             return raster_loss(masks, targets, backend=backend)
 
+        # A copy, since `forward_backward` makes its inputs require a gradient.
         return forward_backward(loss, (preds.clone(),), upstream=upstream)
 
     def make_iou(backend: str) -> Callable[[], object]:
@@ -348,6 +356,7 @@ def training_table(args: argparse.Namespace) -> str:
         f"raster loss of {num_matched} instances, forward + backward": make_loss,
         f"soft IoU, 50 predictions x {num_truths} ground truths": make_iou,
     }
+    # ``auto`` selects the fused kernels of the device.
     rows = []
     for name, make_work in works.items():
         reference = measure(make_work("reference"), device, repeats=2)

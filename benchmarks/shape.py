@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> None:
     rows = []
     for path in args.results:
         for name, shapes in line_shapes(path, args.truth).items():
-            length_ratio = np.nan
+            length_ratio = np.nan  # NaN in the row of a class without lines
             turn = np.nan
             folds = np.nan
             if len(shapes):
@@ -69,27 +69,32 @@ def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
         truth: Annotation file of the split.
 
     Returns:
-        By class, one row per line: its length relative to its ground truth, its mean turn at a
-        vertex in degrees, and the share of vertices with a turn of more than 90 degrees. (n, 3)
+        For each class of lines, by name, an array with one row per matched line: its length
+        relative to its ground truth, its mean turn at a vertex in degrees, and the share of
+        vertices with a turn of more than 90 degrees. Areas are left out. (n, 3)
     """
-    config = ChamferConfig(AnnotationFile(truth).meta.classes)
+    config = ChamferConfig(AnnotationFile(truth).meta.classes)  # rules of AP_chamfer, the defaults
     predictions, _ = read_samples(results, RESULTS_KEY, config.classes)
     truths, _ = read_ground_truth(truth, config.classes)
+    # Both readers return the elements of each sample by token, and counts of ignored elements.
     shapes: dict[str, list[tuple[float, float, float]]] = {}
     for name in config.classes:
         if name not in AREA_CLASSES:
             shapes[name] = []
-    no_elements = MapElements.from_polylines()
+    no_elements = MapElements.from_polylines()  # for samples without results
     samples = []
     for token, elements in truths.items():
         samples.append(Sample(token, predictions.get(token, no_elements), elements))
     for sample_matches in match_samples(samples, MapEvaluator(config)):
+        # `FrameMatches` has one entry for each prediction that counts. Its indices refer to the
+        # elements of the sample.
         matches = cast(FrameMatches, sample_matches["chamfer"])
         if not len(matches.labels):
             continue
         truth_lines = truths[matches.token].polylines
         pred_lines = predictions[matches.token].polylines
-        # Ground truth of each prediction within 1.5 m, the largest threshold, or -1.
+        # The last column belongs to the largest threshold, 1.5 m: index of the ground truth that
+        # the prediction matches, or -1.
         truth_indices = matches.matched_gt[:, -1]
         for index, label, score, truth_index in zip(
             matches.pred_index, matches.labels, matches.scores, truth_indices, strict=True
@@ -122,6 +127,7 @@ def turns(line: FloatArray) -> tuple[float, float]:
         return 0.0, 0.0
     edges = np.diff(line[:, :2], axis=0)
     headings = np.degrees(np.arctan2(edges[:, 1], edges[:, 0]))
+    # A turn across the heading of 180 degrees would differ by 360 degrees.
     differences = (np.diff(headings) + 180.0) % 360.0 - 180.0  # in [-180, 180)
     angles = np.abs(differences)
     return float(angles.mean()), float((angles > FOLD_DEG).mean())

@@ -85,7 +85,9 @@ def main() -> str:
     cfg = read_config(args.config)
     source = read_checked(args.checkpoint)
     require_held_out(source.dataset_meta, args.ground_truth)
-    with building(cfg):
+    with building(cfg):  # adds the name of the config to errors
+        # The config gets the model settings with which the checkpoint was trained. A calibrated
+        # checkpoint has the factors of its sigmas as `temperatures` of the head.
         adopt_settings(cfg, args.checkpoint, None)
         if cfg.model.map_head.get("temperatures"):
             raise InputError(
@@ -99,6 +101,8 @@ def main() -> str:
         pairs = SamplePairs(
             args.results, args.ground_truth, classes, allow_mismatch=True, gaussians=True
         )
+        # Errors and sigmas of the vertices of all predictions that match a ground truth. This reads
+        # the results, so `about` has their metadata afterwards.
         vertices = matched_vertices(pairs, ChamferConfig(classes))
         checkpoint_digest = pairs.about.get(CHECKPOINT)  # None in files of earlier versions
         if checkpoint_digest not in (None, digest(find_checkpoint(args.checkpoint))):
@@ -106,9 +110,10 @@ def main() -> str:
                 f"{args.results} was made with another checkpoint than {args.checkpoint}: give "
                 "this one's predictions (tools/test.py --out)."
             )
+        # Factors along and across the line. (classes, 2)
         factors = fit_factors(vertices, classes, args.sigmas, args.law)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
-    meta = {
+    meta = {  # read when the checkpoint is loaded or tested
         MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())),
         SIGNALS: source.can_bus,
         CALIBRATION: {"law": args.law, "sigmas": args.sigmas},

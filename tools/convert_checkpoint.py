@@ -8,12 +8,14 @@ from gsmap.utils.files import atomic_write
 
 
 def main() -> str:
+    """Convert the checkpoint, and return a summary for the user."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("source", type=Path, help="checkpoint to read")
     parser.add_argument("target", type=output_file, help="checkpoint to write; must not exist")
     args = parser.parse_args()
     if args.target.exists():
         raise FileExistsError(f"{args.target} exists already: choose another name or remove it.")
+    # Torch is slow to import, so the arguments are checked first.
     import torch
 
     from gsmap.checkpoints.convert import convert_state
@@ -21,6 +23,7 @@ def main() -> str:
 
     weights = read_weights(args.source)
     try:
+        # The keys of the weights show which of the two formats they have.
         state, summary = convert_state(weights)
     except ValueError as error:
         raise InputError(f"{args.source}: {error}") from error

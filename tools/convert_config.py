@@ -36,22 +36,26 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
 
     Args:
         source: Config of an original repository; it is read as data.
-        target: Config to write.
+        target: Config to write. It is not written in case of an error.
         allow_changes: Whether to leave out settings of the model that have no counterpart.
 
     Returns:
         Lines with the base config and all settings that have no counterpart.
 
     Raises:
-        ValueError: If the config cannot be converted.
+        ValueError: If the config cannot be read or converted, or if settings of the model have no
+            counterpart and ``allow_changes`` is False.
     """
     settings = read_assignments(source)
     try:
+        # `unplaced` of the conversion has the settings without a counterpart, as `name = value`.
         conversion = convert_upstream(settings)
+        # The settings are merged into a config of GSMap, and the result is formatted as Python.
         text = python_text(merge(conversion, shipped_path("configs")))
     except (
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
     ) as error:  # fmt: skip
+        # Unexpected types, sizes or depths of values can cause all of these.
         raise InputError(f"{source} cannot be converted: {error}") from error
     model_settings = []  # settings of the model without a counterpart
     other_settings = []  # other settings without a counterpart
@@ -80,6 +84,7 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
 
 
 def main() -> str:
+    """Convert with the options of the command line; `run_command` prints the returned text."""
     args = parse_args()
     return convert(args.source, args.target, args.allow_changes)
 

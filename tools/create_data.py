@@ -15,6 +15,7 @@ from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import without_options
 from gsmap.utils.terminal import printable
 
+# Module and help text of each command.
 COMMANDS = {
     "minicity": ("minicity.cli", "generate the MiniCity data set"),
     "nuscenes": ("mapdata.nuscenes.convert", "convert nuScenes or MiniCity"),
@@ -46,6 +47,8 @@ def make() -> str | None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
+    # Only the chosen command gets its options, because they are in its module. The other commands
+    # are listed in the help.
     chosen = next((word for word in sys.argv[1:] if word in COMMANDS), None)
     for name, (module, text) in COMMANDS.items():
         subparser = commands.add_parser(name, help=text, description=text)
@@ -55,9 +58,11 @@ def make() -> str | None:
     if getattr(arguments, "executor", None):  # only some commands have --executor
         return run_on_ray(arguments, sys.argv)
     module, _ = COMMANDS[arguments.command]
-    # The command line is recorded in the output. Without --shard, it is equal for all shards, and
-    # it creates the complete output again.
+    # From here on, `command` is not the name of the command but the whole command line, which is
+    # recorded in the output. Without --shard, it is equal for all shards, and it creates the
+    # complete output again.
     words = without_options(sys.argv, "--shard")
+    # `printable` escapes control characters, which annotation files do not accept.
     arguments.command = printable(shlex.join(["python", *words]))
     return importlib.import_module(module).run(arguments)
 

@@ -19,13 +19,14 @@ from gsmap.utils.errors import InputError
 
 
 def main() -> None:
+    # As in TensorBoard's command, except for the plugins: only its static ones.
     main_lib.global_init()
     board = program.TensorBoard(plugins=default.get_static_plugins())
     try:
-        app.run(board.main, flags_parser=board.configure)
+        app.run(board.main, flags_parser=board.configure)  # parses the options of the command line
     except FlagsError as error:
         raise InputError(str(error)) from error
 
 
 if __name__ == "__main__":
-    run_command(main, clean_up_on_kill=False)
+    run_command(main, clean_up_on_kill=False)  # TensorBoard handles `kill` itself

@@ -38,6 +38,7 @@ _COSTS = {  # number formats of the costs in the table, by cost
     "peak MiB": ".0f",
     "seconds a sample": ".4f",
 }
+# Last words of the keys of statistics of batch norms, which are stored like weights.
 _BATCH_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 
@@ -75,6 +76,10 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
         name: Name of the config in the comparison.
         folder: The folder, with ``metrics.json`` (``tools/test.py --metrics-out``).
         seed: The seed; None reads it from the config in the folder.
+
+    Raises:
+        ValueError: If a file is damaged, the config is missing and its seed is needed, or this seed
+            is no number.
     """
     record = _json(folder / RECORD)
     figures = _json(folder / "metrics.json")
@@ -98,7 +103,7 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     tests = sorted(folder.glob("test/*/[0-9]*.json"))
     if tests:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])
-        costs["seconds a sample"] = timing["time"] - timing["data_time"]
+        costs["seconds a sample"] = timing["time"] - timing["data_time"]  # without loading
     if seed is None and log:
         seed = _config(folder).section("randomness").get("seed")
         if not isinstance(seed, int | None):
@@ -194,7 +199,8 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
 
     Args:
         annotations: The annotation file.
-        changes: Fields of ``ChamferConfig`` or ``RasterConfig``, or ``ground_truth_points``.
+        changes: Changed rules: values of fields of ``ChamferConfig`` or ``RasterConfig``, or
+            ``ground_truth_points``, the number of points to which ground truth is resampled.
 
     Raises:
         ValueError: If there is no such field.
@@ -221,7 +227,12 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
 
 
 def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
-    """Score the ``results.json`` of a run again, with the changed rules of `evaluator_for`."""
+    """Score the ``results.json`` of a run again, with the changed rules of `evaluator_for`.
+
+    Raises:
+        ValueError: If the config in the folder is missing or names no annotation file, or if the
+            results cannot be evaluated.
+    """
     dataset = _config(result.folder).section("test_dataloader.dataset")
     if "ann_file" not in dataset:
         raise InputError(f"{result.folder}: its config does not name the data of its test.")
@@ -270,24 +281,24 @@ def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[
     """Differences of the figures between each config and the first one, seed by seed.
 
     Returns:
-        Differences by name of the config, then by key of the figure, in one list with an entry per
-        seed.
+        Differences by name of the config, then by key of the figure, in one list with an entry for
+        each seed that both configs have.
     """
     done = _finished(results)
     if not done:
         return {}
     first_name = results[0].name
-    first = {}
+    first_figures = {}  # figures of the first config by seed
     for result in done:
         if result.name == first_name:
-            first[result.seed] = result.figures
+            first_figures[result.seed] = result.figures
     differences: dict[str, dict[str, list[float]]] = {}
     for result in done:
-        if result.name == first_name or result.seed not in first:
+        if result.name == first_name or result.seed not in first_figures:
             continue
         by_figure = differences.setdefault(result.name, {})
         for key in _columns(results):
-            difference = result.figures[key] - first[result.seed][key]
+            difference = result.figures[key] - first_figures[result.seed][key]
             by_figure.setdefault(key, []).append(difference)
     return differences
 
@@ -307,40 +318,40 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
     names = list(by_name)
     columns = _columns(results)
     heads = [key.replace("/AP", "") for key in columns]
-    figures = []
-    costs = []
-    for name, of_name in by_name.items():
-        done = _finished(of_name)
-        failed = len(of_name) - len(done)
+    figure_rows = []
+    cost_rows = []
+    for name, config_results in by_name.items():
+        done = _finished(config_results)
+        failed = len(config_results) - len(done)
         seeds = f"{len(done)} ({failed} not done)" if failed else f"{len(done)}"
         row = [name, seeds]
         for key in columns:
             row.append(_cell([result.figures[key] for result in done], factor=100))
-        figures.append(row)
+        figure_rows.append(row)
         row = [name]
         for key, form in _COSTS.items():
             known_costs = [run.costs[key] for run in done if key in run.costs]
             row.append(_cell(known_costs, form=form))
-        costs.append(row)
-    changes = []
+        cost_rows.append(row)
+    difference_rows = []
     for name, differences in differences_to_first(results).items():
-        row = [name, str(len(differences[columns[0]]))]
+        row = [name, str(len(differences[columns[0]]))]  # number of seeds that both configs have
         for key in columns:
             row.append(_cell(differences[key], factor=100, form="+.1f"))
-        changes.append(row)
-    runs = [_run_row(result) for result in results]
+        difference_rows.append(row)
+    run_rows = [_run_row(result) for result in results]
     parts = [
         f"# {title}\n\n`{command}`",
         "AP in percent, mean and standard deviation over seeds.",
-        markdown_table(["config", "seeds", *heads], figures),
+        markdown_table(["config", "seeds", *heads], figure_rows),
     ]
-    if changes:
+    if difference_rows:
         parts.append(f"Differences to {names[0]}, seed by seed.")
-        parts.append(markdown_table(["config", "pairs", *heads], changes))
+        parts.append(markdown_table(["config", "pairs", *heads], difference_rows))
     parts += [
         "Cost. Peak memory is the largest process's, or the GPU's.",
-        markdown_table(["config", *_COSTS], costs),
-        markdown_table(["config", "seed", "state", "folder", "machine", "load"], runs),
+        markdown_table(["config", *_COSTS], cost_rows),
+        markdown_table(["config", "seed", "state", "folder", "machine", "load"], run_rows),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -406,7 +417,8 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
             for log in runs:
                 steps, values = log.series(f"{metric}/mAP", validation=True)
                 last = log.train[-1]
-                if "epoch" in last:  # validation counts epochs: convert them to iterations
+                if "epoch" in last:
+                    # The steps of the validation are epochs. Convert them to iterations.
                     steps = last["step"] / last["epoch"] * steps
                 panel.plot(steps, 100 * values, ".-", color=colour, label=label)
                 label = None  # one entry of the legend for all seeds

@@ -42,9 +42,10 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     weights: list[float] = []
     for frame_index, frame in enumerate(drive.frames):
         elements = frame.elements
-        variances = config.variances(frame)
+        variances = config.variances(frame)  # of each vertex across its outline, in square metres
         for index in np.flatnonzero(elements.labels == label).tolist():
             vertices = slice(elements.offsets[index], elements.offsets[index + 1])
+            # A ring that encloses less than MIN_AREA_M2 has no polygon and is left out.
             for area in polygons_of([elements.points[vertices]]):
                 score = elements.confidence[index]
                 areas.append(area)
@@ -82,12 +83,14 @@ def _group_by_overlap(areas: np.ndarray, frames: IntArray) -> list[IntArray]:
         Indices of the detections of each group. (n,) each
     """
     first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
+    # The query also pairs each area with itself; these pairs are of one frame and dropped, too.
     differ = frames[first] != frames[second]
     first = first[differ]
     second = second[differ]
     shared_m2 = shapely.area(shapely.intersection(areas[first], areas[second]))
     smaller_m2 = np.minimum(shapely.area(areas[first]), shapely.area(areas[second]))
     overlap = shared_m2 >= _MIN_OVERLAP * smaller_m2
+    # Groups are connected by pairs. An area without a pair is a group of one.
     return components(len(areas), first[overlap], second[overlap])
 
 
@@ -108,8 +111,10 @@ def _vote(
         weights: Score over mean variance of each detection, in 1 / m^2. (A,)
 
     Returns:
-        For each connected part, a closed ring in metres, (n, 2), and its mean confidence in [0, 1].
+        For each connected region, a closed ring in metres, (n, 2), and its mean confidence in
+        [0, 1].
     """
+    # Indices of the detections of each frame.
     rows_of_frame: defaultdict[int, list[int]] = defaultdict(list)
     for row, frame_index in enumerate(frames.tolist()):
         rows_of_frame[frame_index].append(row)
@@ -123,26 +128,29 @@ def _vote(
     spots = shapely.get_coordinates(shapely.point_on_surface(faces))  # (faces, 2)
     x, y = spots.T
     votes = np.zeros(len(faces))  # summed weights of the frames whose detections contain the spot
-    all_votes = np.zeros(len(faces))  # summed weights of the frames that have the spot in range
+    possible_votes = np.zeros(len(faces))  # summed weights of the frames with the spot in range
     support = np.zeros(len(faces))  # sum over the frames of their best score at the spot
     for frame_index, rows in rows_of_frame.items():
         in_rows = [shapely.contains_xy(areas[row], x, y) for row in rows]
         contains = np.array(in_rows)  # (rows, faces)
         weight = weights[rows].mean()
         votes += weight * contains.any(axis=0)
-        all_votes += weight * shapely.contains_xy(footprints[frame_index], x, y)
+        possible_votes += weight * shapely.contains_xy(footprints[frame_index], x, y)
         support += (scores[rows][:, None] * contains).max(axis=0)
-    # A detection may extend beyond the range of its frame. There, `votes` can exceed `all_votes`.
-    is_chosen = votes > _MAJORITY * np.maximum(all_votes, votes)
+    # A detection may extend beyond the range of its frame. There, `votes` can be larger than
+    # `possible_votes`.
+    is_chosen = votes > _MAJORITY * np.maximum(possible_votes, votes)
+    # All frames of the drive count here, including frames that did not detect the object.
     num_frames = drive.count_frames_in_range(spots)
     confidence = np.minimum(support / np.maximum(num_frames, 1), 1.0)
     outlines = []
-    for part in shapely.get_parts(shapely.union_all(faces[is_chosen])):
-        if part.area < MIN_AREA_M2:
+    for region in shapely.get_parts(shapely.union_all(faces[is_chosen])):
+        if region.area < MIN_AREA_M2:
             continue
-        in_part = is_chosen & shapely.contains_xy(part, x, y)
-        face_areas_m2 = shapely.area(faces[in_part])
-        mean_confidence = np.average(confidence[in_part], weights=face_areas_m2)
-        ring = shapely.get_coordinates(part.exterior.simplify(_SIMPLIFY_M))
+        in_region = is_chosen & shapely.contains_xy(region, x, y)
+        face_areas_m2 = shapely.area(faces[in_region])
+        mean_confidence = np.average(confidence[in_region], weights=face_areas_m2)
+        # Holes are dropped, because an area is described by one ring.
+        ring = shapely.get_coordinates(region.exterior.simplify(_SIMPLIFY_M))
         outlines.append((ring, float(mean_confidence)))
     return outlines

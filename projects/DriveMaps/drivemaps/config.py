@@ -1,4 +1,4 @@
-"""Parameters of merging."""
+"""Parameters of merging the predictions of a drive's frames into one map."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,11 @@ SIGMA_PER_M = 0.02  # additional standard deviation per metre of distance from t
 
 @dataclass(frozen=True)
 class MergeConfig:
-    """Parameters of merging.
+    """Parameters of merging the predictions of a drive's frames into one map.
 
     Args:
-        gaussians: Whether to weight vertices by their Gaussians, where the results have them.
+        gaussians: Whether the weights of vertices come from their Gaussians, where the results have
+            Gaussians.
         min_confidence: Smallest confidence of a vertex of a line in the map, in [0, 1]. The
             confidence is the sum of the scores of the frames with a line there, divided by the
             number of frames with the vertex in their range (``merge_lines``).
@@ -32,8 +33,9 @@ class MergeConfig:
     def variances(self, frame: DriveFrame) -> FloatArray:
         """Compute the variance of each predicted vertex across its line.
 
-        It is the sum of two terms: the variance of the vertex's Gaussian across the line (a
-        constant without Gaussians), and a term that grows with the distance from the vehicle.
+        A vertex with a smaller variance has more weight in the map. The variance is the sum of two
+        terms: the variance of the vertex's Gaussian across the line (a constant without Gaussians),
+        and a term that grows with the distance from the vehicle.
 
         Args:
             frame: Frame with its predictions.
@@ -48,7 +50,7 @@ class MergeConfig:
         far = (SIGMA_PER_M * distances) ** 2
         if not (self.gaussians and elements.has_gaussians):
             return NEAR_SIGMA_M**2 + far
-        import torch  # only Gaussians need it
+        import torch  # imported here, because it loads slowly and only Gaussians need it
 
         from gsmap.structures.gaussians import Gaussians, extents_along_line
 
@@ -56,7 +58,7 @@ class MergeConfig:
         means = torch.from_numpy(elements.points).split(counts)
         scales = torch.from_numpy(elements.scales).split(counts)
         rotations = torch.from_numpy(elements.rotations).split(counts)
-        sigmas = [np.zeros(0)]  # an empty array, as a frame may have no line
+        sigmas = [np.zeros(0)]  # for a frame without lines, as `concatenate` needs an array
         for line_means, line_scales, line_rotations in zip(means, scales, rotations, strict=True):
             gaussians = Gaussians(line_means, scales=line_scales, rotations=line_rotations)
             _, across = extents_along_line(gaussians).unbind(-1)  # along and across the line

@@ -30,7 +30,7 @@ CLASS_OF_TYPE = {
 _CROSSING = "ped_crossing"
 _BLOCK = 1 << 20  # bytes that are read at once
 _DEEPEST = 20  # largest depth of nested XML elements
-_MOST_PARTS = 10_000_000  # largest number of nodes, ways, relations, and references to them
+_MOST_PARTS = 10_000_000  # largest number of parts: nodes, ways, relations, and references to them
 # Largest number of nodes of all crosswalk rings together, as a multiple of the parts of the file.
 # Without this limit, the crosswalks of a small file could repeat one long line any number of times.
 _MOST_USES = 4
@@ -64,6 +64,7 @@ class _Way(NamedTuple):
     def ring_or_line(self) -> list[str]:
         """IDs of its nodes, with the first node of an area repeated at the end."""
         is_area = self.tags.get("area") == "yes"
+        # Slices are compared, because a way may have no nodes. It is then returned as it is.
         if is_area and self.nodes[:1] != self.nodes[-1:]:
             return [*self.nodes, self.nodes[0]]
         return self.nodes
@@ -106,24 +107,27 @@ def read_lanelet2(
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file is malformed, a number is not finite or out of range, a node or a
-            way is missing, degrees have no origin, or no element can be used.
+        ValueError: If the file is malformed or too large, a number is not finite or out of range,
+            a node or a bound of a crosswalk is missing, degrees have no origin, or no element can
+            be used.
         RuntimeError: If nodes have degrees only and ``pyproj`` is missing.
     """
     path = Path(path)
     parser = _Parser(path)
     parser.read()
+    # The collector takes the lines that have a class, and counts all others by the reason.
     collector = ElementCollector(path, classes, rule=rule or ClassRule(CLASS_KEY))
     collector.unused.update(parser.num_deleted)
     uses_crosswalks = rule is None and _CROSSING in classes
     crosswalks = parser.crosswalks() if uses_crosswalks else {}
     lines = []
-    bounds: set[str] = set()  # IDs of ways that are bounds of crosswalks
+    # IDs of ways that are bounds of crosswalks. They are part of the rings, not lines of the map.
+    bound_ids: set[str] = set()
     for relation_id, relation in crosswalks.items():
         lines.append((_CROSSING, parser.ring_of(relation_id, relation)))
-        bounds.update(relation.way_of_role.values())
+        bound_ids.update(relation.way_of_role.values())
     for way_id, way in parser.ways.items():
-        if way_id in bounds:
+        if way_id in bound_ids:
             continue
         tags = way.tags if rule else _with_class(way.tags, classes)
         class_name = collector.class_of(tags)  # None for an element that is only counted
@@ -141,6 +145,7 @@ def read_lanelet2(
         )
     for class_name, nodes in lines:
         collector.add(class_name, parser.positions(nodes, is_local=is_local))
+    # With the origin, `finish` converts degrees to metres. Without it, lines are in metres already.
     return collector.finish(None if is_local else origin)
 
 
@@ -161,8 +166,17 @@ def _with_class(tags: Mapping[str, str], classes: Sequence[str]) -> dict[str, st
 class _Parser:
     """Parser of the nodes, ways and relations of an OSM file, which expat reads in blocks.
 
+    Errors quote at most 40 characters of a value (``:.40``), because the file may be untrusted.
+
     Args:
         path: File.
+
+    Attributes:
+        nodes: Nodes by their IDs.
+        ways: Line strings by their IDs.
+        relations: Relations by their IDs.
+        num_deleted: Number of elements that an editor has marked as deleted, by the reason
+            ``deleted node``, ``deleted way`` or ``deleted relation``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -196,11 +210,12 @@ class _Parser:
                 while block:
                     parser.Parse(block, False)
                     block = file.read(_BLOCK)
-                parser.Parse(b"", True)
+                parser.Parse(b"", True)  # the end: raises an error if the document is incomplete
             except (expat.ExpatError, ValueError, LookupError) as error:
                 # A LookupError is raised for an unknown encoding.
                 if isinstance(error, InputError):  # from `_error`, which gives the reason
                     raise
+                # The advice differs if the file is a Git LFS pointer or a web page.
                 advice = fetch_advice(start[:200], otherwise="give a Lanelet2 map in OSM XML")
                 raise InputError(f"{self._path} is no valid XML ({error}): {advice}.") from error
 
@@ -220,7 +235,7 @@ class _Parser:
             self._num_parts += 1
             if self._num_parts > _MOST_PARTS:
                 raise self._error(f"it has more than {_MOST_PARTS:,} nodes and references")
-        if self._depth == 2:  # a node, a way or a relation, whose parts follow inside of it
+        if self._depth == 2:  # a node, a way or a relation; the elements inside of it follow
             self._attributes = attributes
             self._tags = {}
             self._references = []
@@ -288,7 +303,7 @@ class _Parser:
         return number
 
     def _required(self, attributes: Mapping[str, str], name: str, owner: str) -> str:
-        """Return an attribute that must exist."""
+        """Return an attribute that must exist; ``owner`` is the name of the XML element."""
         if name not in attributes:
             raise self._error(f"an element {owner!r} has no {name!r}")
         return attributes[name]
@@ -298,12 +313,12 @@ class _Parser:
 
     def _nodes(self, references: Sequence[str]) -> list[_Node]:
         """Find nodes by their IDs."""
-        found = []
+        nodes = []
         for node_id in references:
             if node_id not in self.nodes:
                 raise self._error(f"a line needs node {node_id!r:.40}, which is missing")
-            found.append(self.nodes[node_id])
-        return found
+            nodes.append(self.nodes[node_id])
+        return nodes
 
     def have_local_positions(self, lines: Sequence[Sequence[str]]) -> bool:
         """Whether all nodes of lines, given by their IDs, have positions in the global frame."""
@@ -322,6 +337,9 @@ class _Parser:
 
         Returns:
             x and y in metres, or longitude and latitude in degrees. (n, 2)
+
+        Raises:
+            ValueError: If a node is missing or has no such position.
         """
         points = []
         for node in self._nodes(references):
@@ -333,11 +351,11 @@ class _Parser:
 
     def crosswalks(self) -> dict[str, _Relation]:
         """Lanelets of the subtype ``crosswalk``, by their IDs."""
-        found = {}
+        crosswalks = {}
         for relation_id, relation in self.relations.items():
             if relation.tags.get("subtype") == "crosswalk":
-                found[relation_id] = relation
-        return found
+                crosswalks[relation_id] = relation
+        return crosswalks
 
     def ring_of(self, lanelet_id: str, crosswalk: _Relation) -> list[str]:
         """Join both bounds of a crosswalk to a ring.
@@ -348,6 +366,9 @@ class _Parser:
 
         Returns:
             IDs of the nodes, the first one also at the end.
+
+        Raises:
+            ValueError: If a bound or a node is missing, or crosswalks share their bounds too often.
         """
         bounds = []
         for role in ("left", "right"):
@@ -356,6 +377,7 @@ class _Parser:
                 raise self._error(f"crosswalk {lanelet_id!r:.40} has no {role} bound")
             bounds.append(way.nodes)
         left, right = bounds
+        # Without local positions, the distances of the ends are compared in degrees.
         ends = [left[-1], right[0], right[-1]]
         is_local = all(node.local is not None for node in self._nodes(ends))
         left_end, right_start, right_end = self.positions(ends, is_local=is_local)

@@ -87,9 +87,10 @@ def sample_line(line: FloatArray) -> tuple[FloatArray, FloatArray]:
         line: Vertices of a line with a length, in metres. (n, 2)
 
     Returns:
-        Vertices (m, 2), m >= n, and their positions along the line in metres (m,).
+        Vertices (m, 2), which include the given ones, and their positions along the line in metres
+        (m,). Repeated vertices are returned once.
     """
-    along = arc_lengths(line)
+    along = arc_lengths(line)  # position of each vertex along the line
     steps = np.arange(0.0, along[-1], STEP_M)
     positions = np.union1d(along, steps)
     x = np.interp(positions, along, line[:, 0])
@@ -106,7 +107,7 @@ def dense_predictions(drive: Drive, label: int, config: MergeConfig) -> DenseLin
         config: Parameters of merging, for the weights.
 
     Returns:
-        Lines with a length, of all frames.
+        The lines of all frames, without lines of length 0.
     """
     # Each list begins with an empty entry, so that it can be concatenated without any line.
     points = [np.zeros((0, 2))]
@@ -116,15 +117,15 @@ def dense_predictions(drive: Drive, label: int, config: MergeConfig) -> DenseLin
     counts = [0]  # the cumulative sum of the counts gives the offsets, which begin with 0
     for frame_index, frame in enumerate(drive.frames):
         elements = frame.elements
-        vertex_variances = config.variances(frame)
+        vertex_variances = config.variances(frame)  # across the line, for all vertices of a frame
         for index in np.flatnonzero(elements.labels == label).tolist():
             vertices = slice(elements.offsets[index], elements.offsets[index + 1])
             line = elements.points[vertices]
             along = arc_lengths(line)
             if along[-1] == 0.0:
                 continue
-            vertices_along, positions = sample_line(line)
-            points.append(vertices_along)
+            dense_line, positions = sample_line(line)
+            points.append(dense_line)
             variances.append(np.interp(positions, along, vertex_variances[vertices]))
             frames.append(np.full(len(positions), frame_index))
             scores.append(np.full(len(positions), elements.confidence[index]))
@@ -149,6 +150,7 @@ def normals_of(lines: DenseLines) -> FloatArray:
     previous[lines.offsets[:-1]] += 1
     along = lines.points[following] - lines.points[previous]
     left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    # The limit prevents a division by 0 where the neighbours of a vertex coincide.
     return left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
 
 
@@ -187,8 +189,10 @@ def match_vertices(
     for start in range(0, max(len(queries), 1), _CHUNK_SIZE):  # without queries: one empty chunk
         chunk = queries[start : start + _CHUNK_SIZE]
         boxes = _boxes(points[chunk] - reach[chunk], points[chunk] + reach[chunk])
-        positions, segments = tree.query(boxes)
-        num_pairs_left -= len(positions)
+        # Pairs of a vertex of the chunk and a segment whose boxes intersect, as indices into
+        # `boxes` and into `lines.segment_starts`.
+        box_indices, segment_indices = tree.query(boxes)
+        num_pairs_left -= len(box_indices)
         if num_pairs_left < 0:
             raise InputError(
                 f"the lines of one class lie too close together: more than {_MOST_PAIRS:.0e} pairs "
@@ -197,7 +201,10 @@ def match_vertices(
                 "raise --score-thr."
             )
         candidates = _match_pairs(
-            lines, normals, vertices=chunk[positions], segments=lines.segment_starts[segments]
+            lines,
+            normals,
+            vertices=chunk[box_indices],
+            segments=lines.segment_starts[segment_indices],
         )
         chunks.append(_select_matches(lines, candidates))
     return _concatenate(chunks)
@@ -251,14 +258,15 @@ def _match_pairs(
     end_along = end[:, 1] * normal[:, 0] - end[:, 0] * normal[:, 1]
     extent = end_along - start_along
     # Position of the crossing on the segment, from 0 (start) to 1 (end). A segment that is parallel
-    # to the normal has extent 0, and its position is 0.
+    # to the normal has extent 0. Its position is set to 0, and `is_aligned` then rejects it.
     fraction = -start_along / np.where(extent == 0.0, np.inf, extent)
     distances = (normal * (start + fraction[:, None] * (end - start))).sum(axis=1)
     lengths = np.linalg.norm(end - start, axis=1)
     crosses = start_along * end_along <= 0.0  # the ends lie on both sides of the normal
-    is_parallel = np.abs(extent) > np.cos(np.radians(_MAX_TURN_DEG)) * lengths
+    # Lines may have opposite directions, because the direction of a predicted line is arbitrary.
+    is_aligned = np.abs(extent) > np.cos(np.radians(_MAX_TURN_DEG)) * lengths
     is_near = np.abs(distances) <= REACH_M
-    return Matches(vertices, segments, distances).select(crosses & is_parallel & is_near)
+    return Matches(vertices, segments, distances).select(crosses & is_aligned & is_near)
 
 
 def _select_matches(lines: DenseLines, candidates: Matches) -> Matches:
@@ -277,7 +285,7 @@ def _select_matches(lines: DenseLines, candidates: Matches) -> Matches:
     distinct, rows = np.unique(vertices, return_inverse=True)  # vertices[i] is distinct[rows[i]]
     for side in (1.0, -1.0):  # left and right
         distances = side * candidates.distances
-        is_rival = in_one_frame & (distances >= 0.0)
+        is_rival = in_one_frame & (distances >= 0.0)  # at distance 0: a rival on both sides
         nearest_rival_m = np.full(len(distinct), np.inf)
         np.minimum.at(nearest_rival_m, rows[is_rival], distances[is_rival])
         # Candidates on the other side have negative distances here, and stay.
@@ -288,6 +296,7 @@ def _select_matches(lines: DenseLines, candidates: Matches) -> Matches:
     # only the first one is kept, which is the nearest.
     order = np.lexsort((matches.segments, np.abs(matches.distances), frames, matches.vertices))
     matches = matches.select(order)
+    # The first match is always kept, because no vertex has the index -1.
     is_new_vertex = np.diff(matches.vertices, prepend=-1) != 0
     is_new_frame = np.diff(frames[order], prepend=-1) != 0
     return matches.select(is_new_vertex | is_new_frame)
@@ -301,8 +310,9 @@ def dense_elements(elements: MapElements, label: int) -> DenseLines:
         label: Index of the class.
 
     Returns:
-        Lines with a length, with weights of 1.
+        The lines without lines of length 0. All weights are 1, and the index of the frame is 0.
     """
+    # As in `dense_predictions`, the lists begin with an empty entry.
     points = [np.zeros((0, 2))]
     scores = [np.zeros(0)]
     counts = [0]
@@ -329,11 +339,12 @@ def join_lines(parts: Sequence[DenseLines]) -> DenseLines:
         parts: Groups of lines. The frame indices of each part are shifted, so that they follow the
             frame indices of the previous part.
     """
+    # The empty entries allow a concatenation without groups.
     points = [np.zeros((0, 2))]
     frames = [np.zeros(0, np.int64)]
     scores = [np.zeros(0)]
     weights = [np.zeros(0)]
-    counts = [np.zeros(1, np.int64)]
+    counts = [np.zeros(1, np.int64)]  # their cumulative sum, the offsets, begins with 0
     num_frames = 0
     for part in parts:
         points.append(part.points)
@@ -341,7 +352,7 @@ def join_lines(parts: Sequence[DenseLines]) -> DenseLines:
         scores.append(part.scores)
         weights.append(part.weights)
         counts.append(np.diff(part.offsets))
-        num_frames += int(part.frames.max(initial=-1)) + 1
+        num_frames += int(part.frames.max(initial=-1)) + 1  # adds 0 for a group without lines
     return DenseLines(
         points=np.concatenate(points),
         offsets=np.cumsum(np.concatenate(counts)),

@@ -53,6 +53,7 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     num_vertices = len(lines.points)
     if num_vertices == 0:
         return []
+    # The normals and the matches change with the vertices, so each round computes them again.
     for _ in range(_NUM_ROUNDS):
         normals = normals_of(lines)
         matches = match_vertices(lines, normals)
@@ -61,6 +62,7 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     # A segment has the index of its first vertex, whose score it takes.
     matched_scores = lines.scores[matches.segments]
     score_sum = lines.scores + np.bincount(matches.vertices, matched_scores, minlength=num_vertices)
+    # Frames that have each vertex in their range, with or without a line there. (M,)
     num_frames = drive.count_frames_in_range(lines.points)
     share = score_sum / np.maximum(num_frames, 1)
     # A vertex at a sharp corner has no match. The median of three gives it its neighbours' share.
@@ -70,6 +72,7 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     parts = _select_parts(lines, matches=matches, confidence=confidence, is_confident=is_confident)
     columns = np.column_stack([lines.points, confidence])  # x, y, confidence. (M, 3)
     merged = []
+    # `stitch` joins ends at most JOIN_M apart, and keeps further columns as they are.
     for line in stitch([columns[part] for part in parts]):
         if arc_lengths(line)[-1] >= MIN_LENGTH_M:
             merged.append((line[:, :2], float(line[:, 2].mean())))
@@ -94,6 +97,7 @@ def _check_total_length(drive: Drive, label: int) -> None:
 def _move_to_means(lines: DenseLines, normals: FloatArray, matches: Matches) -> DenseLines:
     """Move each vertex along its normal to the weighted mean of itself and its matches."""
     num_vertices = len(lines.points)
+    # A segment has the index of its first vertex, whose weight it takes.
     weights = lines.weights[matches.segments]
     moments = weights * matches.distances
     total = lines.weights + np.bincount(matches.vertices, weights, minlength=num_vertices)
@@ -126,6 +130,7 @@ def _select_parts(
     line_bounds = np.searchsorted(
         lines.line_indices[matches.segments], np.arange(len(lines.offsets))
     )
+    # Sum over the vertices of each line.
     support = np.add.reduceat(confidence * is_confident, lines.offsets[:-1])  # (N,)
     is_free = is_confident.copy()
     parts = []
@@ -141,6 +146,7 @@ def _select_parts(
         changes = np.flatnonzero(np.diff(padded_flags))
         runs = line_start + changes.reshape(-1, 2)
         for start, end in runs.tolist():
+            # `stitch` closes gaps of this length, so a shorter part is not needed.
             if arc_lengths(lines.points[start:end])[-1] < JOIN_M:
                 continue
             parts.append(slice(start, end))

@@ -9,6 +9,7 @@ from drivemaps.lanelet2_reading import read_lanelet2
 from drivemaps.map_reading import ClassRule, MapFile
 from gsmap.utils.errors import InputError
 
+# Reader of each suffix. All readers have the arguments of `read_map`.
 _READERS = {
     ".geojson": read_geojson,
     ".json": read_geojson,
@@ -33,11 +34,12 @@ def read_map(
             `read_geojson` and `read_lanelet2`.
 
     Returns:
-        Elements in the global frame, and the number of elements that are not used.
+        Elements in metres in the global frame, and the number of elements that are not used, by
+        the reason.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the suffix is not one of these four, or the file cannot be used.
+        ValueError: If the suffix is not one of the four above, or the file cannot be used.
         RuntimeError: If the map is in degrees and ``pyproj`` is missing.
     """
     path = Path(path)

@@ -94,19 +94,22 @@ class Replay:
         whole_lines = [shapely.linestrings(line) for line in self.elements.polylines]
         explored = shapely.Polygon()
         for frame, view in zip(frames, views, strict=True):
-            explored |= self.drive.footprint(frame)
+            explored |= self.drive.footprint(frame)  # range of the frame, in the global frame
             map_lines = []
             for label, whole_line in zip(labels, whole_lines, strict=True):
+                # The explored area may contain several separate parts of a line.
                 for part in shapely.get_parts(shapely.intersection(whole_line, explored)):
                     if not part.length:  # a point where the line touches the explored part
                         continue
                     points = shapely.get_coordinates(part)
-                    raised = _raise_to_ground(
+                    points_3d = _raise_to_ground(
                         points, frames=frames, views=views, frame_tree=frame_tree
                     )
-                    map_lines.append((label, raised))
+                    map_lines.append((label, points_3d))
             predictions = []
             for line in frame.elements.polylines:
+                # `to_frame` returns (x, y) in the annotation frame, and `lift` adds the z of the
+                # ground plane.
                 predictions.append(view.lift(frame.to_frame(line)))
             yield Moment(frame, lines=predictions, map_lines=map_lines)
 
@@ -117,7 +120,7 @@ def _raise_to_ground(
     views: Sequence[FrameView],
     frame_tree: cKDTree,
 ) -> FloatArray:
-    """Add to points the height of the ground, from the ground plane of the nearest frame.
+    """Add the height of the ground to points, from the ground plane of the nearest frame.
 
     Args:
         points: Points (x, y) in metres in the global frame. (n, 2)
@@ -129,12 +132,12 @@ def _raise_to_ground(
         Points (x, y, z) in metres in the global frame. (n, 3)
     """
     _, nearest = frame_tree.query(points)
-    raised = np.empty((len(points), 3))
+    points_3d = np.empty((len(points), 3))
     for index in np.unique(nearest):
         frame = frames[index]
         rows = nearest == index
         local = views[index].lift(frame.to_frame(points[rows]))  # on the ground, in the frame
         pose = frame.sample.global_from_frame
         height = local @ pose[2, :3] + pose[2, 3]  # the third row of the pose gives z
-        raised[rows] = np.column_stack([points[rows], height])
-    return raised
+        points_3d[rows] = np.column_stack([points[rows], height])
+    return points_3d

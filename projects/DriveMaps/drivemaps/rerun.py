@@ -16,6 +16,8 @@ from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
 
 TIMELINE = "time"
+# Paths of entities in the recording. The viewer applies the transform of an entity to all entities
+# below its path, so entities below the vehicle are logged in the annotation frame.
 _VEHICLE = "world/vehicle"
 _MAP = "world/map"
 
@@ -36,13 +38,14 @@ def write_rerun(path: str | Path, replay: Replay) -> None:
             written in this case.
         RuntimeError: If ``rerun-sdk`` is missing.
     """
-    rr = import_extra("rerun", "viz")
+    rr = import_extra("rerun", "viz")  # an optional dependency, imported only here
     recording = rr.RecordingStream("gsmap", recording_id=replay.drive.name)
-    stream = recording.binary_stream()
+    stream = recording.binary_stream()  # collects the logged data until it is read
     cameras = replay.drive.frames[0].sample.cameras
     recording.send_blueprint(_blueprint(cameras))
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     with atomic_write(path, "wb") as file:
+        # A moment is one frame with the part of the map that the drive has explored so far.
         for moment in replay.moments():
             sample = moment.frame.sample
             recording.set_time(TIMELINE, timestamp=np.datetime64(sample.timestamp_ns, "ns"))
@@ -57,7 +60,7 @@ def write_rerun(path: str | Path, replay: Replay) -> None:
                 lines.append(line)
             rgb = _rgb(labels, replay.colours)
             recording.log(_MAP, rr.LineStrips3D(lines, colors=rgb, radii=0.1))
-            file.write(stream.read(flush=True))
+            file.write(stream.read(flush=True))  # after each frame, to limit the memory
     recording.disconnect()
 
 
@@ -72,6 +75,7 @@ def _blueprint(cameras: Sequence[CameraRecord]) -> Any:
         view = rrb.Spatial2DView(
             origin=f"{_VEHICLE}/{camera.name}",
             name=camera.name,
+            # The camera with its image, and the predicted lines, which the viewer projects.
             contents=["$origin/**", f"{_VEHICLE}/predictions/lines"],
         )
         camera_views.append(view)
@@ -89,9 +93,11 @@ def _log_camera(recording: Any, rr: Any, camera: CameraRecord, data_root: Path |
     pinhole = rr.Pinhole(
         image_from_camera=camera.intrinsics, width=camera.width, height=camera.height
     )
+    # rerun expects the transform from an entity to its parent, here from camera to vehicle.
     recording.log(entity, _transform(rr, invert_rigid(camera.cam_from_frame)), pinhole)
     if data_root is not None:
         size_px = (camera.width, camera.height)
+        # The content of the file is copied after a check that it is an image of this size.
         content, kind = image_content(data_root / camera.path, f"camera {camera.name!r}", size_px)
         image = rr.EncodedImage(contents=content, media_type=f"image/{kind}")
         recording.log(entity, image)
@@ -104,8 +110,9 @@ def _log_predictions(recording: Any, rr: Any, moment: Moment, colours: Sequence[
     rgb = _rgb(elements.labels.tolist(), colours)
     recording.log(f"{entity}/lines", rr.LineStrips3D(moment.lines, colors=rgb, radii=0.05))
     if moment.ellipses is not None:
+        # One ellipse per vertex: centre and half axes in metres, rotation as (x, y, z, w).
         centres, half_axes, quaternions = moment.ellipses
-        thickness = np.full(len(centres), 0.01)
+        thickness = np.full(len(centres), 0.01)  # third half axis in metres: nearly flat
         # Each vertex of an element has one Gaussian, with the colour of the element.
         gaussian_rgb = np.repeat(rgb, elements.num_points, axis=0)
         ellipsoids = rr.Ellipsoids3D(
@@ -118,6 +125,6 @@ def _log_predictions(recording: Any, rr: Any, moment: Moment, colours: Sequence[
 
 
 def _rgb(labels: Sequence[int], colours: Sequence[str]) -> np.ndarray:
-    """Colours of elements by their class index. (N, 3) uint8"""
+    """Colour of each element, from its class index and the colours of the classes. (N, 3) uint8"""
     rgb_of_class = np.round(255 * to_rgba_array(colours)[:, :3]).astype(np.uint8)
     return rgb_of_class[np.asarray(labels, int)]

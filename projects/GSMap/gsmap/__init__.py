@@ -18,18 +18,19 @@ __version__ = "0.1.0"
 
 if starts_a_command():
     leave_at_once_on_ctrl_c()  # the imports that follow take seconds
-use_one_thread_in_forks()
-# Imports do not read settings files in the working folder.
+use_one_thread_in_forks()  # forked workers have no OpenMP threads, and torch would wait for them
+# The entries of `sys.meta_path` are import hooks, which Python asks in their order. The first one
+# prevents libraries from reading settings files in the working folder when they are imported.
 sys.meta_path.insert(0, SettingsGuard)
-# An mmcv without compiled operators gets replacements for them. Python asks the last finder last,
-# so the compiled operators are used if mmcv has them.
+# An mmcv without compiled operators gets replacements for them. This hook is asked after Python's
+# usual search, so the compiled operators are used if mmcv has them.
 sys.meta_path.append(MmcvExtFinder)
 # Modules of this package can be imported by their former names.
 sys.meta_path.append(MovedModules())
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
-    {
+    {  # the subpackage or module that provides each name
         "BEVGrid": "structures",
         "MapElements": "structures",
         "MapEvaluator": "evaluation",

@@ -1,6 +1,8 @@
 """Cameras of a bag: camera info by the rules of ROS' image_pipeline, and topics of images.
 
-A camera info has the camera matrix K of raw images and the projection matrix P of rectified images.
+A camera info is a message with the calibration of a camera (``sensor_msgs/CameraInfo``). It has the
+camera matrix K (3, 3) of raw images, the projection matrix P (3, 4) of rectified images, and the
+distortion D of raw images.
 """
 
 import re
@@ -24,11 +26,12 @@ class ImageTopic:
     """Images of one topic, as collected by a first pass over a bag.
 
     Args:
-        frame_id: Frame of the first image.
-        times_ns: Times of all images. (n,)
+        frame_id: Coordinate frame of the camera, from the first image.
+        times_ns: Times of all images in nanoseconds. (n,)
         sizes_px: Width and height of the first images.
         trouble: Reason why no image can be used; empty if images can be used.
-        unstamped: Number of images with the stamp 0, which get their time of recording.
+        unstamped: Number of images with the stamp 0, which get their time of recording. The caller
+            of `add` counts them.
     """
 
     frame_id: str = ""
@@ -38,12 +41,18 @@ class ImageTopic:
     unstamped: int = 0
 
     def add(self, message: Any, time_ns: int) -> None:
-        """Add the image of a message."""
+        """Add the image of a message.
+
+        Args:
+            message: Raw or compressed image of ROS.
+            time_ns: Time of the image in nanoseconds.
+        """
         if not self.times_ns:
-            self.frame_id = message.header.frame_id.lstrip("/")
+            self.frame_id = message.header.frame_id.lstrip("/")  # ROS 1 allows "/camera"
+            # Reason why the format is not supported, or None.
             self.trouble = trouble_with(message) or ""
         if len(self.times_ns) < _MOST_SIZES and not self.trouble:
-            size_px = image_size(message)
+            size_px = image_size(message)  # None for a damaged image
             if size_px:
                 self.sizes_px.append(size_px)
         self.times_ns.append(time_ns)
@@ -134,10 +143,11 @@ def build_camera(
         The camera, and notes on assumptions.
 
     Raises:
-        ValueError: If the camera info has no focal lengths, or does not fit the size of the images.
+        ValueError: If the camera info has no focal lengths, or does not fit the size of the images,
+            or if `RigCamera` rejects the size or the distortion.
     """
     image_topic, info_topic = topics
-    where = f"camera {name!r}: its camera info {info_topic}"
+    where = f"camera {name!r}: its camera info {info_topic}"  # beginning of messages
     distortion = _field(info, "d")
     notes = []
     full_px = (int(info.width), int(info.height))
@@ -150,12 +160,13 @@ def build_camera(
         )
     matrix, matrix_notes = _choose_matrix(info, rectified=rectified, where=where)
     notes += matrix_notes
+    # Some drivers crop the images to a region of the sensor, and merge pixels of it (binning).
     offset_px, binning, size_px = _window(info, full_px)
     image_sizes = images.sizes_px
     is_any_size_unknown = not image_sizes or min(full_px) < 1
     if size_px in image_sizes or is_any_size_unknown:
         matrix = _crop(matrix, offset_px=offset_px, binning=binning)
-    elif full_px in image_sizes:
+    elif full_px in image_sizes:  # the driver has neither cropped nor binned the images
         size_px = full_px
         notes.append(
             f"{where} has binning or a region of interest, but its images have all {full_px} "
@@ -191,8 +202,12 @@ def _choose_matrix(info: Any, rectified: bool, where: str) -> tuple[np.ndarray, 
         where: Beginning of messages.
 
     Returns:
-        The matrix (3, 3), and a note if it replaces the other one. The matrix may be empty if the
-        camera info has no size. `RigCamera` then raises an error.
+        The matrix (3, 3), and a list with a note if it replaces the other one. If the camera info
+        has no size, the matrix is not checked and may be zeros. `RigCamera` then raises an error.
+
+    Raises:
+        ValueError: If neither K nor P has focal lengths, or if only the other one has them and the
+            camera has distortion.
     """
     k = _matrix(info, "k")
     p = _matrix(info, "p")
@@ -227,6 +242,7 @@ def _window(
         Offset of the region (x, y) in pixels, binning (x, y), and size of the images (width,
         height).
     """
+    # In ROS, a binning of 0 stands for 1, and a region of size 0 for the whole sensor.
     binning_x = max(int(getattr(info, "binning_x", 1)), 1)
     binning_y = max(int(getattr(info, "binning_y", 1)), 1)
     offset_px = (0, 0)
@@ -242,6 +258,6 @@ def _window(
 def _crop(matrix: np.ndarray, offset_px: tuple[int, int], binning: tuple[int, int]) -> np.ndarray:
     """Camera matrix of a region of interest with binning, as in image_geometry. (3, 3)"""
     matrix = matrix.copy()
-    matrix[:2, 2] -= offset_px
+    matrix[:2, 2] -= offset_px  # cx and cy
     matrix[:2] /= np.array(binning)[:, None]
     return matrix

@@ -31,6 +31,7 @@ def _open(path: Path) -> AnnotationFile:
     """
     file = AnnotationFile(path)
     try:
+        # `file` finds its batches without the footer. Other programs find them by the footer.
         reader = pa.ipc.open_file(pa.memory_map(str(path)))
         for number, batch in enumerate(file.batches):
             if not reader.get_batch(number).equals(batch):
@@ -47,6 +48,7 @@ def _open(path: Path) -> AnnotationFile:
 
 def _broken_files(sample: MapSample, root: Path) -> list[str]:
     """Read every file that a sample names, and return a description of each broken file."""
+    # Imported here, because the module imports slow libraries that other checks do not need.
     from gsmap.datasets.transforms.points import read_points
 
     problems = []
@@ -60,6 +62,7 @@ def _broken_files(sample: MapSample, root: Path) -> list[str]:
     if sample.lidar:
         lidar_paths.append(sample.lidar.path)
         lidar_paths += [sweep.path for sweep in sample.lidar.sweeps]
+    # Values of a point in nuScenes: x, y, z, intensity and number of the laser.
     for path in lidar_paths:
         try:
             read_points(str(root / path), load_dim=5)
@@ -114,6 +117,7 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
         if root is not None:
             samples = Progress(file, desc=path.name, unit="samples")
             problems = []
+            # The workers read the samples at once, and the results keep the order of the samples.
             for sample_problems in ordered_map(partial(_broken_files, root=root), samples, workers):
                 problems += sample_problems
             if problems:

@@ -16,7 +16,8 @@ PARALLEL = "parallel"
 # (`mapdata.nuscenes.map`), `long_edges`, and `open_outlines`.
 CROSSINGS = (UNITED, EDGES, PARALLEL)
 EDGE_MARGIN_M = 0.2  # distance from the edge of the patch at which open outlines end
-PARALLEL_COSINE_GAP = 0.01  # one minus the cosine of the largest angle, about 8 degrees
+# One minus the cosine of the largest angle between sides that count as parallel, about 8 degrees.
+PARALLEL_COSINE_GAP = 0.01
 
 
 def long_edges(polygons: np.ndarray) -> np.ndarray:
@@ -60,6 +61,8 @@ def open_outlines(pieces: np.ndarray, owner: np.ndarray, patch: LocalPatch) -> n
 def cut_rings(rings: np.ndarray, box: shapely.Polygon) -> tuple[np.ndarray, np.ndarray]:
     """Cut rings with a box, and join pieces of a ring that touch.
 
+    A ring whose first vertex lies inside the box is cut there too, so two of its pieces touch.
+
     Args:
         rings: Rings, in metres. (rings,)
         box: The box, in the frame of the rings.
@@ -71,9 +74,9 @@ def cut_rings(rings: np.ndarray, box: shapely.Polygon) -> tuple[np.ndarray, np.n
     for i in np.flatnonzero(shapely.get_type_id(parts) == COLLECTION):
         members = shapely.get_parts(parts[i])  # lines, and points where the ring touches the box
         parts[i] = shapely.multilinestrings(members[is_line(members)])
-    pieces, owner = shapely.get_parts(shapely.line_merge(parts), return_index=True)
+    pieces, ring_of_piece = shapely.get_parts(shapely.line_merge(parts), return_index=True)
     has_length = is_line(pieces)
-    return pieces[has_length], owner[has_length]
+    return pieces[has_length], ring_of_piece[has_length]
 
 
 def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
@@ -94,7 +97,7 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
     bounds = shapely.bounds(crossings)  # smallest x, y and largest x, y (n, 4)
     # Two boxes touch if each of them begins before the other ends, along both axes.
     begins_before_end = (bounds[:, None, :2] <= bounds[None, :, 2:]).all(-1)  # (n, n)
-    near = begins_before_end & begins_before_end.T
+    near = begins_before_end & begins_before_end.T  # the boxes of two crossings touch
     np.fill_diagonal(near, False)
     is_free = np.ones(len(crossings), dtype=bool)  # False once a crossing is in `merged`
     sides = np.zeros((len(crossings), 2))  # unit vectors; only crossings with a neighbour need them
@@ -106,7 +109,7 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
             continue
         is_free[i] = False
         others = np.flatnonzero(near[i] & is_free)
-        cosines = np.abs(sides[others] @ sides[i])
+        cosines = np.abs(sides[others] @ sides[i])  # without sign, as sides have no direction
         others = others[1.0 - cosines < PARALLEL_COSINE_GAP]
         is_free[others] = False
         if len(others):

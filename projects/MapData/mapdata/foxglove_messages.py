@@ -18,7 +18,9 @@ def foxglove_parser(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
     Returns:
         Function that converts the bytes of a message to an object with the fields of the ROS type.
     """
+    # protobuf is an optional package of the extra `bags`.
     descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2", extra="bags")
+    # A separate pool for this file, as files may have different versions of a type.
     pool = import_extra("google.protobuf.descriptor_pool", extra="bags").DescriptorPool()
     factory = import_extra("google.protobuf.message_factory", extra="bags")
     for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
@@ -31,10 +33,12 @@ def foxglove_parser(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
 def _header(message: Any) -> Any:
     """ROS header with the time and the frame of a Foxglove message."""
     stamp = SimpleNamespace(sec=message.timestamp.seconds, nanosec=message.timestamp.nanos)
-    # Transforms have a parent frame instead of a frame.
+    # Transforms have a parent frame instead of a frame (see `_transform`).
     return SimpleNamespace(stamp=stamp, frame_id=getattr(message, "frame_id", ""))
 
 
+# The functions below return objects with the fields of a ROS message. The data of images are not
+# copied.
 def _compressed_image(message: Any) -> Any:
     return SimpleNamespace(
         header=_header(message), format=message.format, data=memoryview(message.data)

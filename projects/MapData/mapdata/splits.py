@@ -12,8 +12,9 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name, read_json, read_text
 from gsmap.utils.split_lists import list_identity
 
-OFFICIAL = "official"
-_PARTS = ("train", "val", "test")
+OFFICIAL = "official"  # name of the split that the publisher of a data set defines
+_PARTS = ("train", "val", "test")  # parts that the name of a text file can give
+# Form of a split file, for messages.
 _FORM = '{"train": ["scene-0001", ...], "val": [...]}, or a text file with one scene per line'
 
 
@@ -33,7 +34,7 @@ class SplitList:
 
     @cached_property
     def identity(self) -> str:
-        """Name and digest of the list, for annotation files."""
+        """Name and digest of the list, ``name@digest``, for annotation files."""
         return list_identity(self.name, scenes=self.scenes)
 
     def missing_note(self, missing: Collection[str], total: int, where: str, allowed: bool) -> str:
@@ -63,6 +64,7 @@ class SplitList:
 
 def _families() -> list[str]:
     """Names of the files of published lists, in the order in which their splits are offered."""
+    # Backwards, so that the published lists of ``streammapnet`` come first.
     folder = files("mapdata").joinpath("split_lists")
     return sorted((Path(file.name).stem for file in folder.iterdir()), reverse=True)
 
@@ -91,10 +93,12 @@ def published_split(name: str, dataset: str) -> SplitList:
     Raises:
         ValueError: If there is no split with this name.
     """
+    # A family is a file with the lists of one publication, for all data sets.
     for family in _families():
         lists = _read_family(family)[dataset]
         if name in lists["splits"]:
             scenes: dict[str, list[str]] = {}
+            # A part, such as ``train``, consists of the scenes of several groups.
             for part, groups in lists["splits"][name].items():
                 scenes[part] = []
                 for group in groups:
@@ -133,11 +137,16 @@ def read_split_file(path: Path) -> SplitList:
 
 
 def _is_list_of_names(value: Any) -> bool:
+    """Whether a value of a JSON file is a list of texts."""
     return isinstance(value, list) and all(isinstance(name, str) for name in value)
 
 
 def _read_lines(path: Path) -> dict[str, list[str]]:
-    """Read the scenes of one part of a split. The name of the part is a word of the file's name."""
+    """Read the scenes of one part of a split, by the name of the part, a word of the file's name.
+
+    Raises:
+        ValueError: If the file's name has none of the words of `_PARTS`, or two different ones.
+    """
     words = [word for word in re.split(r"[^a-z]+", path.stem.lower()) if word in _PARTS]
     if len(set(words)) != 1:
         raise InputError(f"the name of {path} must have one of the words {', '.join(_PARTS)}")
@@ -156,7 +165,7 @@ def requested_split(options: Any, dataset: str) -> SplitList | None:
         dataset: Name of the data set, ``nuscenes`` or ``av2``.
 
     Returns:
-        The list; None if the options name no list.
+        The list; None if the options name no list, for the official split of the data set.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -194,7 +203,7 @@ def resolve_scenes(
                 missing.append(entry)
                 continue
             name = name_of[entry]
-            other = part_of.setdefault(name, part)
+            other = part_of.setdefault(name, part)  # `part` unless the scene already has a part
             if other != part:
                 raise InputError(f"scene {name} is in both {other} and {part}.")
     return part_of, missing

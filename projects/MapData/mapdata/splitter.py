@@ -31,7 +31,7 @@ def _near_scenes(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -
         neighbours = tree.query_ball_point(positions[scenes == scene], distance_m)
         samples = np.unique(np.concatenate(neighbours).astype(np.int64))
         near[scene, scenes[samples]] = True
-    return near | near.T
+    return near | near.T  # symmetric despite rounding errors of distances
 
 
 def _select_scenes(
@@ -59,6 +59,7 @@ def _select_scenes(
         covered |= near[scene]
         if selected.sum() >= count:
             return selected, ~covered
+        # Column j of `near` is scene j; scenes that are already covered are lost anyway.
         num_lost = (near & ~covered).sum(1)  # scenes that training would lose with each scene
         others = np.flatnonzero(~selected)
         order = np.lexsort((rank[others], num_lost[others]))  # by loss, then by rank
@@ -96,12 +97,12 @@ def split_scenes(
         # `names` are the scenes on this map, and `scenes` is the index of each sample's scene.
         names, scenes = np.unique(places.scenes[rows], return_inverse=True)
         count = round(val_share * len(names))
-        if not count:
+        if not count:  # a map with few scenes is used for training only
             parts["train"] += names.tolist()
             continue
         near = _near_scenes(scenes, places.positions[rows], distance_m=min_distance_m)
-        selected, far = _select_scenes(near, count=count, rng=rng)
-        parts["train"] += names[far].tolist()
+        selected, is_far = _select_scenes(near, count=count, rng=rng)
+        parts["train"] += names[is_far].tolist()
         parts["val"] += names[selected].tolist()
     if not parts["train"] or not parts["val"]:
         raise InputError(
@@ -137,6 +138,7 @@ def run(arguments: argparse.Namespace) -> str:
     )
     train = places.select(np.isin(places.scenes, parts["train"]))
     val = places.select(np.isin(places.scenes, parts["val"]))
+    # Distance in metres of each validation sample from the nearest training sample on its map.
     distance, _ = sample_overlap(train, val)
     write_text(arguments.out, json.dumps(parts, indent=1) + "\n")
     left_out = len(np.unique(places.scenes)) - len(parts["train"]) - len(parts["val"])

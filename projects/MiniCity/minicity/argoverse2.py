@@ -23,7 +23,7 @@ from minicity.scene_map import (
 WALKWAY_WIDTH_M = 3.0
 LINE_WIDTH_M = 0.15
 DOUBLE_GAP_M = 0.12
-DASH_M, GAP_M = 3.0, 6.0
+DASH_M, GAP_M = 3.0, 6.0  # length of a dash, and of the space between two dashes
 SAME_LINE_M = 0.3  # lines closer than this are one line
 WEAR = 0.15  # share of the paint that is worn off
 # Standard deviation of the Gaussian filter of heights, which are stored in steps of about 5 cm.
@@ -96,7 +96,7 @@ def lane_paint(
     for lane in static_map.get_scenario_lane_segments():
         for marking in (lane.left_lane_marking, lane.right_lane_marking):
             if marking.mark_type is not LaneMarkType.NONE:
-                kinds.append(marking.mark_type.value)
+                kinds.append(marking.mark_type.value)  # style and colour, such as DASHED_YELLOW
                 lines.append(shapely.LineString(marking.polyline[:, :2]))
     paint: dict[str, list[np.ndarray]] = {"white": [], "yellow": []}
     for i in _unique_lines(np.array(lines, dtype=object), window):
@@ -109,7 +109,9 @@ def _unique_lines(lines: np.ndarray, window: shapely.Polygon) -> list[int]:
     """Return the indices of the lines in a window, without lines that repeat an earlier line."""
     tree = shapely.STRtree(lines)
     unique: set[int] = set()
-    for i in sorted(tree.query(window, predicate="intersects").tolist()):
+    for i in sorted(tree.query(window, predicate="intersects").tolist()):  # in the order of the map
+        # A line that only crosses line i or continues it is close, too. It has a large Hausdorff
+        # distance, the largest distance of a point of one line from the other line.
         close = tree.query(lines[i], predicate="dwithin", distance=SAME_LINE_M).tolist()
         earlier = unique.intersection(close)
         is_repeated = any(
@@ -158,6 +160,8 @@ def height_grid(
     Raises:
         ValueError: If no height is known inside the bounds, or the grid is rotated.
     """
+    # Transform p -> s (R p + t) from the city to columns and rows of the grid: rotation R,
+    # translation t in metres, and scale s in cells per metre.
     grid_from_city = heights.array_Sim2_city
     if not np.allclose(grid_from_city.R, np.eye(2)):
         raise InputError("the ground height grid is turned against the city frame.")
@@ -168,12 +172,13 @@ def height_grid(
     low = np.clip(np.floor(corners[0]).astype(int), 0, (columns - 1, rows - 1))
     high = np.clip(np.ceil(corners[1]).astype(int), low + 1, (columns, rows))
     part = heights.array[low[1] : high[1], low[0] : high[0]].astype(np.float64)
-    # A point p_city has the grid coordinates s (p_city + t). The centre of cell i is at i + 0.5.
+    # As R is the identity, a point p has the grid coordinates s (p + t). The centre of cell i is at
+    # i + 0.5.
     origin = (low + 0.5) * cell_m - grid_from_city.t
     x = origin[0] + np.arange(part.shape[1]) * cell_m
     y = origin[1] + np.arange(part.shape[0]) * cell_m
     grid_x, grid_y = np.meshgrid(x, y)
-    shapely.prepare(trusted)
+    shapely.prepare(trusted)  # makes the test of many points fast
     known = np.isfinite(part) & shapely.contains_xy(trusted, grid_x, y=grid_y)
     if not known.any():
         raise InputError(f"no ground height is known on the road inside {bounds}.")

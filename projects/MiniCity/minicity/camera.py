@@ -48,11 +48,12 @@ class Camera:
     @cached_property
     def center(self) -> Array:
         """Position of the camera in the world, in metres. (3,)"""
+        # The inverse of the transform x -> R x + t maps the origin to -R^T t.
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
     @cached_property
     def world_from_pixel(self) -> Array:
-        """Matrix that maps (u, v, 1) to a viewing direction in the world. (3, 3)"""
+        """Matrix that maps (u, v, 1) to a viewing direction in the world, of any length. (3, 3)"""
         return self.cam_from_world[:3, :3].T @ np.linalg.inv(self.intrinsics)
 
     def to_camera(self, points: Array) -> Array:
@@ -83,6 +84,7 @@ def clip_near(polygon: Array, near_m: float = NEAR_M) -> Array:
         Corners of the part with z >= ``near_m``; m is 0 if there is no such part. (m, 3)
     """
     corners = []
+    # Edges from each corner a to the next corner b; the last edge ends at the first corner.
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if a[2] >= near_m:
             corners.append(a)

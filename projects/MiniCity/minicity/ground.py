@@ -50,7 +50,7 @@ def ground_from_pixel(camera: Camera, ground_z_m: float) -> Array:
 
     Its third row gives the vertical part of the viewing direction: negative below the horizon.
     """
-    ray = camera.world_from_pixel
+    ray = camera.world_from_pixel  # maps (u, v, 1) to a viewing direction in the world. (3, 3)
     x, y, z = camera.center
     height = z - ground_z_m
     # A ray (rx, ry, rz) meets the plane at x - height * rx / rz and y - height * ry / rz. In
@@ -107,8 +107,10 @@ def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> 
     target = np.maximum(footprints.across, footprints.along / MAX_SAMPLES)
     fit = np.floor(np.log2(np.maximum(target / resolution_m, 1.0) * 1.2))
     levels = np.clip(fit, 0, num_levels - 1).astype(int)
+    # Number of texture pixels along the footprint, at the level of the row.
     counts = np.clip(np.ceil(footprints.along / (resolution_m * 2.0**levels)), 1, MAX_SAMPLES)
-    samples = (2 ** np.ceil(np.log2(counts))).astype(int)  # rounded up to a power of two
+    # Powers of two, so that more adjacent rows have equal numbers and form one band.
+    samples = (2 ** np.ceil(np.log2(counts))).astype(int)
     bands: list[Band] = []
     for row in np.flatnonzero(footprints.visible).tolist():
         level = int(levels[row])
@@ -150,12 +152,13 @@ def render_flat_ground(
     """
     image = background.copy()
     homography = ground_from_pixel(camera, ground_z_m)
-    skyline = _plane_skyline(camera, homography[2])
+    skyline = _plane_skyline(camera, homography[2])  # image row of the horizon in each column
     footprints = plane_footprints(camera, homography)
     for band in make_bands(footprints, texture.resolution_m, num_levels=len(texture.levels)):
         # As in `Band.sample_rows`: row k of the samples is at row first_row + k / band.samples.
         first_row = band.start - 0.5 + 0.5 / band.samples
         pixel_from_sample = np.array([[1.0, 0, 0], [0, 1.0 / band.samples, first_row], [0, 0, 1.0]])
+        # With `WARP_INVERSE_MAP`, M maps a pixel of the output to a pixel of the texture.
         samples = cv2.warpPerspective(
             texture.levels[band.level],
             M=_texture_from_world(texture, band.level) @ homography @ pixel_from_sample,
@@ -185,8 +188,10 @@ def render_uneven_ground(
         without ground (H,).
     """
     image = background.copy()
+    # Intersections of the rays of the camera with the ground. `terrain.points` returns the world
+    # (x, y) of each pixel of the given rows, (rows, W, 2).
     terrain = make_terrain(camera, height)
-    skyline = terrain.horizon()
+    skyline = terrain.horizon()  # image row in each column, above which there is no ground
     footprints = terrain_footprints(terrain)
     for band in make_bands(footprints, texture.resolution_m, num_levels=len(texture.levels)):
         texture_from_world = _texture_from_world(texture, band.level)

@@ -12,7 +12,7 @@ from minicity.camera import Camera
 from minicity.curves import Array
 from minicity.texture import Image
 
-BGR = tuple[float, float, float]
+BGR = tuple[float, float, float]  # values for blue, green and red, the order of OpenCV
 
 # Ranges of the random values of a scene: (smallest, largest).
 BRIGHTNESS = (0.88, 1.12)
@@ -89,7 +89,7 @@ _GAINS = ((1.08, 1.1, 1.12), (1.02, 1.0, 0.98), (0.52, 0.5, 0.62), (0.74, 0.72, 
 def random_lighting(rng: np.random.Generator) -> Lighting:
     """Draw the light of a scene: mostly clear or cloudy, sometimes dusk or rain."""
     weather = str(rng.choice(WEATHERS, p=SHARES))
-    column = WEATHERS.index(weather)
+    index = WEATHERS.index(weather)
     azimuth = float(rng.uniform(low=0, high=2 * np.pi))
     bright = float(rng.uniform(low=BRIGHTNESS[0], high=BRIGHTNESS[1]))
     elevation = VEILED_ELEVATION_RAD
@@ -103,8 +103,8 @@ def random_lighting(rng: np.random.Generator) -> Lighting:
         streaks = int(rng.integers(RAIN_STREAKS[0], RAIN_STREAKS[1]))
     horizontal = np.cos(elevation)  # length of the horizontal part of the direction to the sun
     sun = [horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)]
-    blue, green, red = _GAINS[column]
-    look = {name: values[column] for name, values in _LOOKS.items()}
+    blue, green, red = _GAINS[index]
+    look = {name: values[index] for name, values in _LOOKS.items()}
     return Lighting(
         weather=weather,
         sun=np.array(sun),
@@ -129,11 +129,12 @@ def render_sky(camera: Camera, lighting: Lighting) -> Image:
     pixels = np.stack([np.full(rows.shape, camera.width / 2), rows, np.ones(rows.shape)])
     directions = camera.world_from_pixel @ pixels
     # Sine of the elevation of each row, which is 0 at the horizon and 1 overhead.
+    # Rows below the horizon get 0.
     sines = np.clip(directions[2] / np.linalg.norm(directions, axis=0), 0, 1)
     top_share = sines**SKY_CURVE
     top = np.array(lighting.sky_top)
-    low = np.array(lighting.haze)
-    column = (low + top_share[:, None] * (top - low)).astype(np.uint8)
+    horizon = np.array(lighting.haze)
+    column = (horizon + top_share[:, None] * (top - horizon)).astype(np.uint8)
     size = (camera.width, camera.height)
     return cv2.resize(column[:, None], size, interpolation=cv2.INTER_NEAREST)
 
@@ -149,6 +150,7 @@ def haze_ground(image: Image, distance_m: Array, eye_m: float, lighting: Lightin
     """
     # Share of the sky's colour in each row: by haze or by the mirroring, whichever is stronger.
     haze_share = 1 - np.exp(-distance_m / lighting.haze_m)
+    # The road mirrors more at a flatter line of sight.
     slope = eye_m / np.maximum(distance_m, NEAREST_GROUND_M)
     mirror_share = lighting.wet * np.exp(-slope / WET_SLOPE)
     veil = np.maximum(haze_share, mirror_share)
@@ -176,17 +178,18 @@ def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
     table = np.clip(np.arange(256)[:, None] * np.array(lighting.gain), 0, 255).astype(np.uint8)
     image = cv2.LUT(image, np.ascontiguousarray(table[:, None]))  # OpenCV takes (256, 1, 3)
     if lighting.streaks:
-        _draw_streaks(image, lighting, rng=rng)
+        _draw_streaks(image, lighting, rng=rng)  # `image` is a new picture since `cv2.LUT`
     rows, columns = image.shape[:2]
     # The noise of a picture is a random part of a fixed tile, which repeats for large pictures.
     tile = _sensor_noise(lighting.noise)
-    room = (max(1, NOISE_PX - rows), max(1, NOISE_PX - columns))  # number of possible corners
-    top, left = rng.integers(0, room).tolist()
+    num_corners = (max(1, NOISE_PX - rows), max(1, NOISE_PX - columns))  # along y, x
+    top, left = rng.integers(0, num_corners).tolist()
     bottom = top + rows
     right = left + columns
     if bottom > NOISE_PX or right > NOISE_PX:
         repeats = (-(-bottom // NOISE_PX), -(-right // NOISE_PX), 1)  # quotients rounded up
         tile = np.tile(tile, repeats)
+    # The sum is limited to [0, 255].
     return cv2.add(image, tile[top:bottom, left:right], dtype=cv2.CV_8U)
 
 

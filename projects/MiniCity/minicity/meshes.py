@@ -1,4 +1,7 @@
-"""Objects on the ground as coloured quads and discs."""
+"""Objects on the ground as coloured quads and discs.
+
+A quad is a flat face with four corners. Seen from outside of the object, they run anticlockwise.
+"""
 
 from dataclasses import dataclass, field
 
@@ -8,10 +11,10 @@ from numpy.typing import NDArray
 from minicity.curves import Array, rectangle
 from minicity.town import Building
 
-WINDOW_PITCH_M = 3.4
-STOREY_M = 3.0
-TRUNK_M = 0.28
-POLE_M = 0.16
+WINDOW_PITCH_M = 3.4  # distance between the centres of neighbouring windows, about
+STOREY_M = 3.0  # height of a storey, about
+TRUNK_M = 0.28  # width of a trunk
+POLE_M = 0.16  # width of a pole
 BARK = (48.0, 62.0, 78.0)  # BGR
 # Discs of a crown: x, y, z offsets in crown radii, then brightness.
 CROWN = (
@@ -38,7 +41,7 @@ class Mesh:
         discs: (x, y, z, radius) of each disc; discs always face the camera.
         disc_colors: Colour of each disc in full light, BGR in [0, 255].
         disc_groups: Index of the object of each disc.
-        anchors: Reference point of each object. Each (3,)
+        anchors: Reference point of each object, from which its distance is measured. Each (3,)
         backdrop: Whether each object is a building, drawn before all other objects.
     """
 
@@ -113,14 +116,15 @@ class FrozenMesh:
     Attributes:
         quads: Corners in metres, anticlockwise from outside. (F, 4, 3)
         colors: Colours of the quads in full light, BGR in [0, 255]. (F, 3)
-        groups: Object of each quad. (F,)
+        groups: Index of the object of each quad. (F,)
         layers: Drawing order of each quad inside its object. (F,)
         glow: Whether each quad shines without light on it. (F,)
         discs: x, y, z and radius in metres. (D, 4)
         disc_colors: Colours of the discs in full light, BGR in [0, 255]. (D, 3)
-        disc_groups: Object of each disc. (D,)
-        anchors: Reference point of each object in metres. (G, 3)
-        backdrop: Whether each object is a building. (G,)
+        disc_groups: Index of the object of each disc. (D,)
+        anchors: Reference point of each object in metres, from which its distance is measured.
+            (G, 3)
+        backdrop: Whether each object is a building, drawn before all other objects. (G,)
     """
 
     quads: Array
@@ -154,6 +158,9 @@ def merge(first: FrozenMesh, second: FrozenMesh) -> FrozenMesh:
 
 def prism_faces(base: Array, low_m: float, high_m: float, top_scale: float = 1.0) -> Array:
     """Compute the side and top faces of a prism over a rectangle, anticlockwise from outside.
+
+    Side i stands on the edge from corner i of the rectangle to the next corner. It begins with its
+    lower corners. There is no bottom face.
 
     Args:
         base: Corners of the rectangle in metres, anticlockwise. (4, 2)
@@ -225,7 +232,7 @@ def add_building(mesh: Mesh, building: Building, lit_windows: bool = False) -> N
         lit_windows: Whether the windows shine.
     """
     mesh.begin(np.append(building.footprint.mean(axis=0), 0.0), backdrop=True)
-    glass = (110.0, 190.0, 235.0) if lit_windows else (95.0, 80.0, 62.0)
+    glass = (110.0, 190.0, 235.0) if lit_windows else (95.0, 80.0, 62.0)  # yellow, or dark blue
     *walls, roof = prism_faces(building.footprint, low_m=0.0, high_m=building.height_m)
     mesh.add_quad(roof, building.color)
     storeys = max(1, int(building.height_m / STOREY_M))
@@ -284,5 +291,5 @@ def add_pole(mesh: Mesh, pole: Array, ground_z_m: float = 0.0) -> None:
     for side in prism_faces(shaft, low_m=ground_z_m, high_m=top)[:4]:  # without the top
         mesh.add_quad(side, (92, 94, 96))
     lamp = rectangle(foot, 0.0, length_m=4 * POLE_M, width_m=4 * POLE_M)
-    for face in prism_faces(lamp, low_m=top - 0.3, high_m=top):
+    for face in prism_faces(lamp, low_m=top - 0.3, high_m=top):  # a box at the top of the pole
         mesh.add_quad(face, (120, 122, 124))

@@ -41,7 +41,7 @@ class Node:
         return sum(n is not None for n in self.neighbours)
 
     def arm_dir(self, arm: int) -> Array:
-        """Return the unit direction of an arm, away from the node. (2,)"""
+        """Return the unit direction of an arm (0 to 3), away from the node. (2,)"""
         return unit(self.turn_rad + arm * np.pi / 2)
 
 
@@ -56,17 +56,18 @@ def make_nodes(side: int, seed: int, name: str) -> list[Node]:
     Returns:
         ``side * side`` nodes, row by row.
     """
+    # The state of the generator depends only on these values, not on other parts of the town.
     rng = make_rng(seed, name, "nodes")
     nodes = []
     for i in range(side * side):
-        cell = np.array([i % side, i // side])
+        cell = np.array([i % side, i // side])  # column and row in the grid
         position = MARGIN_M + PITCH_M * cell + rng.uniform(low=-17, high=17, size=2)
         neighbours: list[int | None] = []
         for step in STEPS:
             other = cell + step
             inside = bool(np.all(other >= 0) and np.all(other < side))
-            node = int(other[0] + side * other[1])
-            neighbours.append(node if inside else None)
+            other_index = int(other[0] + side * other[1])
+            neighbours.append(other_index if inside else None)
         turn_rad = float(rng.uniform(low=-0.3, high=0.3))
         nodes.append(Node(position, turn_rad, neighbours))
     _remove_streets(nodes, rng)
@@ -75,7 +76,7 @@ def make_nodes(side: int, seed: int, name: str) -> list[Node]:
 
 def _remove_streets(nodes: list[Node], rng: np.random.Generator) -> None:
     """Remove random streets in place; each node keeps at least two."""
-    streets = []
+    streets = []  # index of a node, and the arm of this node at which the street leaves
     for i, node in enumerate(nodes):
         for arm in (0, 1):  # arms 2 and 3 are arm 0 or 1 of a neighbour
             if node.neighbours[arm] is not None:
@@ -91,6 +92,7 @@ def _remove_streets(nodes: list[Node], rng: np.random.Generator) -> None:
 
 def random_section(rng: np.random.Generator) -> CrossSection:
     """Choose the lanes, the widths and the median of a road at random."""
+    # The order of the draws must not change, because all towns depend on it.
     one_way = rng.random() < 0.12
     forward = int(rng.choice([1, 2, 3], p=[0.35, 0.45, 0.2]))
     backward = 0
@@ -123,6 +125,7 @@ def random_style(rng: np.random.Generator) -> RoadStyle:
     line_m = float(rng.uniform(low=0.14, high=0.22))
     edge_line = bool(rng.random() < 0.35)
     crossing = str(rng.choice(["zebra", "ladder"], p=[0.7, 0.3]))
+    # Most roads have little wear. Both values are drawn before one of them is chosen.
     light_wear = rng.uniform(low=0.0, high=0.2)
     heavy_wear = rng.uniform(low=0.2, high=0.55)
     return RoadStyle(
@@ -167,6 +170,7 @@ def _curve_to_neighbour(nodes: list[Node], index: int, arm: int) -> Array:
         start=node.position,
         start_dir=node.arm_dir(arm),
         end=other.position,
+        # The street arrives at the opposite arm, against the direction of this arm.
         end_dir=-other.arm_dir((arm + 2) % 4),
         count=60,
     )
@@ -186,9 +190,9 @@ def _join_at_bend(first: Array, second: Array) -> Array:
         end=tail[0],
         end_dir=end_dir / np.linalg.norm(end_dir),
         count=30,
-        pull=1.15,
+        pull=1.15,  # length of the end tangents relative to the distance of the ends
     )
-    return np.concatenate([head[:-1], bend, tail[1:]])
+    return np.concatenate([head[:-1], bend, tail[1:]])  # the ends of the bend are in head and tail
 
 
 def make_chains(nodes: list[Node], seed: int, name: str) -> list[Chain]:
@@ -200,7 +204,8 @@ def make_chains(nodes: list[Node], seed: int, name: str) -> list[Chain]:
         name: Name of the town.
 
     Returns:
-        Every street once.
+        Every street once. A closed ring of nodes that are all of degree two has no end, and is left
+        out.
     """
     chains = []
     used_arms: set[tuple[int, int]] = set()
@@ -212,6 +217,7 @@ def make_chains(nodes: list[Node], seed: int, name: str) -> list[Chain]:
                 continue
             rng = make_rng(seed, name, "street", i, arm)
             chain = _follow_street(nodes, start=i, arm=arm, rng=rng)
+            # The arms at both ends, so that the street is not followed back from its other end.
             used_arms.add((i, arm))
             used_arms.add((chain.nodes[-1], chain.arms[1]))
             chains.append(chain)
@@ -227,6 +233,7 @@ def _follow_street(nodes: list[Node], start: int, arm: int, rng: np.random.Gener
     visited = [start, current]
     while nodes[current].degree == 2:
         back = (arm + 2) % 4  # arm at which the street arrives
+        # The only other arm with a street.
         arm = next(a for a in range(4) if a != back and nodes[current].neighbours[a] is not None)
         center = _join_at_bend(center, _curve_to_neighbour(nodes, current, arm))
         following = nodes[current].neighbours[arm]
@@ -269,7 +276,7 @@ def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> 
         Metres along each road.
     """
     count = len(arms)
-    distances = [9.0] * count  # smallest distances
+    distances = [9.0] * count  # metres; no distance becomes smaller
     for i in range(count):
         j = (i + 1) % count
         angle = (arms[j][0] - arms[i][0]) % (2 * np.pi)
@@ -302,14 +309,15 @@ def make_roads(
     """
     meetings: list[list[tuple[int, bool, float]]] = [[] for _ in nodes]
     for c, chain in enumerate(chains):
+        # Index of the first and of the last entry of `chain.nodes` and `chain.arms`.
         for end, at_start in ((0, True), (-1, False)):
             node = chain.nodes[end]
             angle = nodes[node].turn_rad + chain.arms[end] * np.pi / 2
             meetings[node].append((c, at_start, float(angle % (2 * np.pi))))
     cuts = np.zeros((len(chains), 2))  # length to cut off at the start and at the end, in metres
     for n, meeting in enumerate(meetings):
-        meeting.sort(key=lambda m: m[2])
-        if nodes[n].degree < 3:
+        meeting.sort(key=lambda m: m[2])  # by angle, anticlockwise
+        if nodes[n].degree < 3:  # no junction, so no road is cut
             continue
         arms = []
         for c, at_start, angle in meeting:
@@ -327,7 +335,7 @@ def make_roads(
             index=c,
             start_node=chain.nodes[0],
             end_node=chain.nodes[-1],
-            center=resample(part, STATION_M),
+            center=resample(part, STATION_M),  # points at equal distances of about 3 m
             section=chain.section,
             style=chain.style,
         )

@@ -106,6 +106,7 @@ class SceneRenderer:
         eye_m = float(camera.center[2]) - ground_z_m
         haze_ground(image, distance, eye_m=eye_m, lighting=self.lighting)
         eye = camera.center[:2]
+        # `draw_mesh` leaves out farther vehicles in any case, so no meshes are made for them.
         near = [v for v in vehicles if np.linalg.norm(v.center[:2] - eye) < SMALL_FAR_M]
         mesh = merge(self.static, vehicle_mesh(near))
         draw_mesh(image, camera, mesh=mesh, lighting=self.lighting)
@@ -142,7 +143,7 @@ def render_camera(
 
 def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting: Lighting) -> None:
     """Darken the ground under vehicles and in their shadows, in place."""
-    mask: Image | None = None
+    mask: Image | None = None  # share of the light of each pixel, 255 for all of it
     light = LIGHT_IN_SHADOW if lighting.shadow > 0 else LIGHT_UNDER_VEHICLES
     shade = 255 * light
     forward = camera.cam_from_world[2, :3]  # optical axis in the world
@@ -155,7 +156,7 @@ def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting
         outline = vehicle_shadow(vehicle, lighting)
         z = float(vehicle.center[2] - vehicle.size[2] / 2)
         world = np.column_stack([outline, np.full(len(outline), z)])
-        polygon = clip_near(camera.to_camera(world))
+        polygon = clip_near(camera.to_camera(world))  # the part in front of the camera
         if len(polygon) < 3:
             continue
         px = camera.to_pixels(polygon)
@@ -185,10 +186,12 @@ def vehicle_shadow(vehicle: Vehicle, lighting: Lighting) -> Array:
     c = np.cos(vehicle.yaw_rad)
     s = np.sin(vehicle.yaw_rad)
     half = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * vehicle.size[:2]
-    base = half @ np.array([[c, s], [-s, c]]) + vehicle.center[:2]  # corners (4, 2), turned by yaw
+    # Corners turned by yaw. The matrix is transposed, as it multiplies row vectors. (4, 2)
+    base = half @ np.array([[c, s], [-s, c]]) + vehicle.center[:2]
     if lighting.shadow <= 0:
         return base
     height = vehicle.size[2]
+    # Displacement of the shadow of the roof from the footprint.
     shadow_shift = -lighting.sun[:2] / max(float(lighting.sun[2]), LOWEST_SUN) * height
     hull = cv2.convexHull(np.concatenate([base, base + shadow_shift]).astype(np.float32))
     return hull[:, 0].astype(float)  # OpenCV returns (n, 1, 2)
@@ -238,7 +241,7 @@ def draw_mesh(image: Image, camera: Camera, mesh: FrozenMesh, lighting: Lighting
         *_visible_quads(camera, mesh, visible=visible, distance=distance, lighting=lighting),
         *_visible_discs(camera, mesh, visible=visible, distance=distance, lighting=lighting),
     ]
-    veil = 1 - np.exp(-distance / lighting.haze_m)
+    veil = 1 - np.exp(-distance / lighting.haze_m)  # share of the colour of the haze, by object
     haze = np.array(lighting.haze)
     for drawable in sorted(drawables, key=lambda d: d.order):
         share = veil[drawable.group]
@@ -276,7 +279,7 @@ def _visible_quads(
         distance: Distance of each object in metres. (G,)
         lighting: Light on the quads.
     """
-    index = np.flatnonzero(visible[mesh.groups])
+    index = np.flatnonzero(visible[mesh.groups])  # quads of visible objects
     if not len(index):
         return
     corners = camera.to_camera(mesh.quads[index])
@@ -365,7 +368,7 @@ def _visible_discs(
         distance: Distance of each object in metres. (G,)
         lighting: Light on the discs.
     """
-    index = np.flatnonzero(visible[mesh.disc_groups])
+    index = np.flatnonzero(visible[mesh.disc_groups])  # discs of visible objects
     centers = camera.to_camera(mesh.discs[index, :3])
     light = lighting.ambient + lighting.direct * max(0.0, float(lighting.sun[2]))
     scale = 1 << SHIFT  # fixed-point steps of OpenCV per pixel
@@ -379,7 +382,7 @@ def _visible_discs(
         group = int(mesh.disc_groups[index[k]])
         depth = float(np.linalg.norm(centers[k]))
         yield _Drawable(
-            order=(1, -float(distance[group]), 9, -depth),  # above all layers of quads
+            order=(1, -float(distance[group]), 9, -depth),  # 9 is above all layers of quads
             group=group,
             polygon=None,
             disc=(round(x * scale), round(y * scale), round(radius * scale)),
@@ -388,12 +391,17 @@ def _visible_discs(
 
 
 def frustum_mask(camera: Camera, mesh: FrozenMesh) -> NDArray[np.bool_]:
-    """Whether each object may touch the picture, by a sphere around its anchor. (G,)"""
+    """Whether each object may touch the picture, by a sphere around its anchor. (G,)
+
+    Only the left and right edges of the picture are tested.
+    """
     centers = camera.to_camera(mesh.anchors)
     radius = np.where(mesh.backdrop, BACKDROP_RADIUS_M, SMALL_RADIUS_M)
     focal = camera.intrinsics[0, 0]
     cx = camera.intrinsics[0, 2]
     mask = centers[:, 2] > -radius
+    # For the left and the right edge: the position of each object towards the edge in metres, and
+    # the distance of the edge from the optical axis in pixels.
     for side, edge in ((-centers[:, 0], cx), (centers[:, 0], camera.width - cx)):
         # Distance beyond the plane through the camera and this edge of the picture.
         beyond = (side * focal - centers[:, 2] * edge) / np.hypot(focal, edge)

@@ -16,7 +16,8 @@ TROUSERS: Color = (70.0, 58.0, 52.0)
 SKIN: Color = (120.0, 150.0, 190.0)
 TAIL_LIGHT: Color = (40.0, 40.0, 215.0)
 HEAD_LIGHT: Color = (225.0, 235.0, 235.0)
-# Indices of the faces of `prism_faces` over a rectangle that heads along +x.
+# Indices of the faces of `prism_faces` over a rectangle that heads along +x. `rectangle` lists the
+# corners front left, back left, back right, front right, so face 1 stands on the back edge.
 BACK_FACE = 1
 FRONT_FACE = 3
 TOP_FACE = 4
@@ -76,7 +77,8 @@ def _add_motor_vehicle(mesh: Mesh, size: Size, color: Color, tall: bool) -> None
     shoulder_share = 0.9 if tall else 0.55
     shoulder_m = height * shoulder_share  # top of the body
     outline = _body(size, back=-0.5, front=0.5, width=1.0)
-    for face in prism_faces(outline, low_m=0.0, high_m=0.28):  # wheels, as one dark box
+    # The wheels are one dark box. The body covers its upper edge.
+    for face in prism_faces(outline, low_m=0.0, high_m=0.28):
         mesh.add_quad(face, TYRES, layer=0)
     body = prism_faces(outline, low_m=0.22, high_m=shoulder_m, top_scale=0.97)
     for index, face in enumerate(body):
@@ -109,7 +111,7 @@ def _add_person(mesh: Mesh, size: Size, color: Color) -> None:
     mesh.add_disc(head_center, radius_m=0.08 * height, color=SKIN)
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=4096)  # the meshes of a scene's vehicles are needed in every frame
 def _template(category: str, size: Size, color: Color) -> FrozenMesh:
     """Mesh of a vehicle or person that stands at the origin, on z = 0, and heads along +x."""
     mesh = Mesh()
@@ -126,8 +128,9 @@ def vehicle_mesh(vehicles: list[Vehicle]) -> FrozenMesh:
     """Mesh of vehicles and people in the world, with one object for each, in their order."""
     if not vehicles:
         return Mesh().freeze()
+    # Meshes at the origin, which are shared through a cache. They are copied and not changed here.
     templates = [_template(v.category, v.size, color=v.color) for v in vehicles]
-    objects = np.arange(len(templates))
+    objects = np.arange(len(templates))  # index of each object
     quad_groups = np.repeat(objects, [len(t.quads) for t in templates])  # object of each quad
     disc_groups = np.repeat(objects, [len(t.discs) for t in templates])  # object of each disc
     yaw = np.array([v.yaw_rad for v in vehicles])

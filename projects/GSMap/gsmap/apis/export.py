@@ -48,7 +48,8 @@ class ExportedDetector(nn.Module):
         memory: Names of the memory tensors; empty before the first call of `example_inputs`.
 
     Raises:
-        ValueError: If the model reads LiDAR, or its head or its memory cannot be exported.
+        ValueError: If the model reads LiDAR, or its head, its memory or its map prior cannot be
+            exported.
     """
 
     def __init__(self, model: Any) -> None:
@@ -77,6 +78,7 @@ class ExportedDetector(nn.Module):
             )
         self.model = model
         stream_inputs = () if model.temporal is None else STREAM_INPUTS
+        # Names of the calibration tensors that the BEV encoder and the map prior read.
         calibration = [*model.bev_encoder.calibration]
         prior_inputs: tuple[str, ...] = ()
         if model.prior is not None:
@@ -120,7 +122,7 @@ class ExportedDetector(nn.Module):
 
         Args:
             images: Pixel values of the data pipeline. (V, 3, H, W)
-            inputs: Other inputs of `forward` by name.
+            inputs: Other inputs of `forward` by name. The entry ``can_bus`` is replaced in place.
 
         Returns:
             Fields of the elements in the order of ``output_names``, and the new memory by name.
@@ -131,14 +133,15 @@ class ExportedDetector(nn.Module):
         all_levels = self.model.extract_img_feats(images[None])
         feats = self.model.bev_encoder.levels(all_levels)
         if "can_bus" in inputs:
-            # Signals 0 to 2 and 17, which need earlier frames, become 0 (`without_history`).
+            # Signals 0 to 2 and 17, which need earlier frames, become 0, as in `without_history`,
+            # which is written in numpy and cannot be exported.
             inputs["can_bus"] = nn.functional.pad(inputs["can_bus"][OF_ONE_FRAME], (3, 1))
         batched = {name: value[None] for name, value in inputs.items()}
         head = self.model.map_head
         temporal = self.model.temporal
         image_size = tuple(images.shape[-2:])
         outputs = self.model.bev_encoder.encode(feats, calibration=batched, img_shape=image_size)
-        further_hooks: tuple[Any, ...] = ()
+        further_hooks: tuple[Any, ...] = ()  # a hook can append queries to the queries of the head
         prior = self.model.prior
         if prior is not None:
             window = batched[PRIOR_INPUT]
@@ -150,9 +153,10 @@ class ExportedDetector(nn.Module):
             past = Past(
                 memory={name: batched[f"{MEMORY_PREFIX}{name}"] for name in self.memory},
                 now_from_then=batched["now_from_then"],
-                seconds=batched["seconds"][0],
+                seconds=batched["seconds"][0],  # (1,): one value for the only sample of the batch
                 continues=batched["continues"][0] > 0.5,
             )
+            # The encoder outputs, fused with the memory, and a hook with the previous queries.
             recalled = temporal.recall(outputs, past)
             recalled.further_hooks = further_hooks
             predictions = head(recalled.outputs, **recalled.hooks)
@@ -173,6 +177,8 @@ class ExportedDetector(nn.Module):
     @torch.no_grad()
     def example_inputs(self, num_cams: int, image_size: tuple[int, int]) -> tuple[Tensor, ...]:
         """Create inputs of the right shapes, with black images of cameras at the origin.
+
+        All matrices are identities, and all other inputs are zero.
 
         For a model with memory, the first call runs the model on a frame to find the names and
         shapes of the memory.
@@ -202,6 +208,7 @@ class ExportedDetector(nn.Module):
                 inputs[name] = torch.eye(4).repeat(num_cams, 1, 1)
         images = torch.zeros(num_cams, 3, *image_size)
         if self.model.temporal is not None and not self.memory:
+            # A copy, because `step` replaces an entry.
             _, memory = self.step(images, inputs=dict(inputs))
             self.memory = tuple(memory)
             for name, value in memory.items():
@@ -234,8 +241,8 @@ def export_onnx(
 
     Raises:
         RuntimeError: If the packages of the extra ``onnx`` are not installed.
-        ValueError: If the model reads LiDAR, has another number of cameras, or needs an operator
-            that ONNX does not have.
+        ValueError: If the model cannot be exported (`ExportedDetector`), has another number of
+            cameras, or needs an operator that ONNX does not have.
     """
     onnx = import_extra("onnx", "onnx")
     import_extra("onnxscript", "onnx")  # a dependency of torch's exporter
@@ -257,8 +264,8 @@ def export_onnx(
         raise InputError(_describe_export_error(error)) from error
     assert program is not None  # None is returned only if torch writes the file itself
     proto = program.model_proto
-    for part in (proto.graph, *proto.graph.node):
-        del part.metadata_props[:]  # stack traces with paths of this machine
+    for graph_or_node in (proto.graph, *proto.graph.node):
+        del graph_or_node.metadata_props[:]  # stack traces with paths of this machine
     metadata = graph_metadata(exported, cameras=cameras, image_size=image_size, frame=frame)
     onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})
     onnx.checker.check_model(proto)
@@ -293,7 +300,8 @@ def graph_metadata(
         "score_threshold": head.coder.score_threshold,
         "unfold_classes": list(head.coder.unfold_classes),
     }
-    mount = getattr(model, "mount", None)  # only models of `load_model` have one
+    # Pose of the annotation frame on the vehicle. Only models of `load_model` have one.
+    mount = getattr(model, "mount", None)
     if mount is not None:
         metadata["ground_z_m"] = mount.ground_z_m
         metadata["ground_from_frame"] = mount.matrix.tolist()
@@ -306,7 +314,11 @@ def graph_metadata(
 
 
 def signals_rule(model: Any) -> str:
-    """Describe the ``can_bus`` values with which a model from `load_model` was trained."""
+    """Describe the ``can_bus`` values with which a model from `load_model` was trained.
+
+    The text is one of `NO_SIGNALS`, `POSE_ONLY_RULE` and `CAN_BUS_RULE`, by which `OnnxInferencer`
+    decides whether a sample needs signals.
+    """
     if getattr(model, "without_signals", False):
         return NO_SIGNALS
     cfg = getattr(model, "cfg", None)
@@ -379,6 +391,7 @@ def quantize_onnx(
             """Inputs of the next sample, or None after the last one."""
             return next(remaining_inputs, None)
 
+    # `quantize_static` writes its result itself. The file is complete before it gets its place.
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
         quantized = Path(folder, "int8.onnx")
         quantize_static(
@@ -419,7 +432,7 @@ def graph_inputs(
         meta = packed["data_samples"].metainfo
         inputs = inferencer.prepare(images, meta=meta, stream=streams)
         yield meta["token"], inputs
-        if streams is not None:
+        if streams is not None:  # the next sample of this scene needs the new memory
             outputs = inferencer.run(inputs)
             inferencer.remember(streams, meta=meta, outputs=outputs)
 
@@ -437,9 +450,10 @@ def largest_differences(
             points is therefore ignored for these classes.
 
     Returns:
-        The largest difference of a score, and the largest distance in metres of an element from the
-        nearest element of its class. The distance of two elements is the largest difference of a
-        coordinate. Both values are infinite if the numbers of elements of a class differ.
+        The largest difference of a score, and the largest distance in metres of an element of
+        ``found`` from the nearest element of its class in ``expected``. The distance of two
+        elements is the largest difference of a coordinate, and infinite if their numbers of points
+        differ. Both returned values are infinite if the numbers of elements of a class differ.
     """
     if sorted(found.labels) != sorted(expected.labels):
         return float("inf"), float("inf")
@@ -482,7 +496,8 @@ def _operator_translations() -> dict[Any, Any]:
         """Compute weighted sums of table rows for bags of equal size, without a loop over bags.
 
         A bag is the group of rows of one sum. Deformable sampling
-        (`gsmap.ops.deformable_sampling.sum_rows`) has bags of equal size.
+        (`gsmap.ops.deformable_sampling.sum_rows`) has bags of equal size. The parameters are in the
+        order of torch's operator.
         """
         is_sum = mode == 0  # the other modes are the mean and the maximum
         if not is_sum or weights is None or include_last_offset:

@@ -36,18 +36,22 @@ def open_dataset(
         ann_file: File to which samples are written. Nothing is written if ``source`` is an
             annotation file in the annotation frame of the model.
 
+    Returns:
+        The data set in test mode. It reads ``ann_file``, or the annotation file of ``source``.
+
     Raises:
         FileNotFoundError: If a file does not exist.
         ValueError: If the samples cannot be used with this config.
     """
     settings: dict[str, Any] = dict(cfg.test_dataloader.dataset)
-    if not settings.get("frame"):
+    if not settings.get("frame"):  # the samples stay in their frame
         mount = Mount(source.frame, ground_z_m=source.ground_z_m)
     samples = source.samples
     in_model_frame = mount.suits(source.frame, ground_z_m=source.ground_z_m)
     if isinstance(samples, AnnotationFile) and in_model_frame:
         ann_file = samples.path
     else:
+        # `change_frame` returns a sample as it is if it needs no transformation.
         samples = [
             change_frame(sample, frame=source.frame, wanted=mount, ground_z_m=source.ground_z_m)
             for sample in samples
@@ -57,7 +61,7 @@ def open_dataset(
         settings["ground_z_m"] = None  # the written file contains the height
     settings["ann_file"] = str(ann_file.resolve())
     settings["test_mode"] = True
-    # Accept any split, and the number of coordinates in the file.
+    # With None, the data set accepts any split, and as many coordinates as the file has.
     settings["split"] = None
     settings["dim"] = None
     settings["cameras"] = _select_cameras(cfg, samples)
@@ -66,7 +70,7 @@ def open_dataset(
     settings["serialize_data"] = len(samples) > 1
     if source.data_root is not None:
         settings["data_root"] = str(source.data_root.resolve())
-    with building(cfg):
+    with building(cfg):  # adds the name of the config to errors
         return DATASETS.build(settings)
 
 
@@ -83,7 +87,7 @@ def _annotation_meta(
     """
     options = cfg.test_dataloader.dataset
     grid = options.get("grid") or cfg.model.grid
-    dim = 2
+    dim = 2  # 3 if a point has a height
     for sample in samples:
         for instance in sample.instances or ():
             dim = max(dim, instance.points.shape[1])
@@ -95,6 +99,7 @@ def _annotation_meta(
         x_range=tuple(grid["x_range"]),
         y_range=tuple(grid["y_range"]),
         dim=dim,
+        # This entry marks a file whose poses are unknown.
         options={} if has_poses else {"poses": False},
         command=INFERENCE_COMMAND,
         ground_z_m=mount.ground_z_m,
@@ -102,7 +107,7 @@ def _annotation_meta(
 
 
 def _select_cameras(cfg: Config, samples: Sequence[MapSample]) -> Sequence[str] | None:
-    """Select the cameras of the config; all cameras of the samples if they have none of these.
+    """Select the cameras of the config, or all cameras of the samples if they lack all of these.
 
     Returns:
         Names of the cameras; None if the config names none, which selects all.

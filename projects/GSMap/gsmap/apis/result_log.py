@@ -32,7 +32,7 @@ class ResultLog:
 
     Attributes:
         done: Tokens of the finished frames.
-        broken: Reason of each broken frame, by token.
+        broken: Reason of each broken frame, which is a frame that cannot be used, by token.
         dropped: Number of frames of a run with other settings, which are not used.
     """
 
@@ -48,14 +48,16 @@ class ResultLog:
         self._tokens = None if tokens is None else frozenset(tokens)
         self._classes = classes
         self.path = out.with_name(out.name + _SUFFIX)
-        self._head = json.dumps(settings, sort_keys=True) + "\n"
+        self._head = json.dumps(settings, sort_keys=True) + "\n"  # first line of the log
         self.done: set[str] = set()
         self.broken: dict[str, str] = {}
 
     def __enter__(self) -> "ResultLog":
         self.out.parent.mkdir(parents=True, exist_ok=True)
+        # `open_to_append` returns an unbuffered file. The buffer makes reading of lines fast.
         self._file = io.BufferedRandom(open_to_append(self.path))
         try:
+            # The file stays locked until it is closed.
             lock(
                 self._file,
                 f"another process writes {self.path}: wait for its end, or give another --out.",
@@ -70,8 +72,9 @@ class ResultLog:
         """Read the finished frames of the file, and remove other content from the file.
 
         The first line of the file has the settings of a run, and every other line has a frame. If
-        the settings differ from the settings of this run, all frames are removed. Otherwise only an
-        incomplete last line is removed, which a killed run may leave.
+        the settings differ from the settings of this run, all frames are removed. They are checked
+        first, so that no file of another program is emptied. Otherwise only an incomplete last line
+        is removed, which a killed run may leave.
         """
         self._file.seek(0)
         head = self._file.readline()
@@ -103,7 +106,7 @@ class ResultLog:
             self._file.flush()
 
     def _is_frame(self, frame: Any, same_settings: bool) -> bool:
-        """Whether the value of a line is a new frame of the run.
+        """Whether the value of a line is a frame of the run that no earlier line has.
 
         Args:
             frame: Value of the line.
@@ -131,12 +134,13 @@ class ResultLog:
         if not isinstance(vectors, list):
             return False
         classes = self._classes if same_settings else None
-        unknown = Counter[str]()
+        unknown = Counter[str]()  # number of elements of each class that is not in `classes`
         try:
+            # The elements are only checked, so the result is not used.
             read_vectors(vectors, classes or (), unknown, gaussians=True)
         except (ValueError, KeyError, TypeError, OverflowError):
             return False
-        unknown.pop(THREE_D, None)  # counts the elements with heights, which are valid
+        unknown.pop(THREE_D, None)  # this key counts samples with heights, which are valid
         return classes is None or not unknown
 
     def _require(self, is_valid: bool, line_number: int) -> None:
@@ -185,14 +189,14 @@ class ResultLog:
         """Write the result file in the order of tokens, and remove the unfinished one.
 
         Args:
-            meta: Metadata of the result file.
+            meta: Metadata of the result file, in types of JSON.
 
         Returns:
             Number of frames in the result file. Broken frames are left out.
         """
         positions: list[tuple[str, int]] = []  # token and start of its line, in bytes
         with self.path.open("rb") as file:
-            file.readline()
+            file.readline()  # the settings
             position = file.tell()
             for line in file:
                 token = json.loads(line)["sample_token"]
@@ -201,6 +205,7 @@ class ResultLog:
                 position += len(line)
             positions.sort()
 
+            # The frames are read one at a time, because all of them may not fit in memory.
             def samples() -> Iterator[tuple[str, list[dict[str, Any]]]]:
                 for token, position in positions:
                     file.seek(position)

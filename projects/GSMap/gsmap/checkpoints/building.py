@@ -19,10 +19,12 @@ from gsmap.utils.shipped import shipped_path
 _BUILDER = build_from_cfg.__code__  # every registry builds its objects with this function
 _RUNNER = "mmengine.runner.runner"  # compared by name, since importing the runner is slow
 _CONFIGS = "mmengine.config"  # package whose modules read configs
+# Exceptions that wrong settings can cause in the classes that are built from them.
 _SETTINGS_ERRORS = (
     ValueError, TypeError, LookupError, RuntimeError, AttributeError, AssertionError,
     ArithmeticError, ImportError,
 )  # fmt: skip
+# Messages of Python (groups: function and argument) and of mmengine (group: the unknown type).
 _UNEXPECTED_ARGUMENT = re.compile(r"([\w.]+)\(\) got an unexpected keyword argument '(\w+)'")
 _ABSENT_TYPE = re.compile(r"(\S+) is not in the .+? registry")
 
@@ -108,7 +110,7 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
     except _SETTINGS_ERRORS as error:
         parts = _parts_under_construction(error)
         if kind is not None:
-            parts.append(_Part(registry=None, kind=kind))
+            parts.append(_Part(registry=None, kind=kind))  # the outermost part
         # Errors of the machine are not changed: `user_message` already describes them to users.
         fault = None if user_message(error) else _describe_fault(error, parts=parts, cfg=cfg)
         if fault is None:
@@ -160,7 +162,7 @@ def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> st
     is_config_error = scope.get("__name__", "").startswith(_CONFIGS)
     if is_config_error and isinstance(error, KeyError | AttributeError):
         return f"a setting is missing: {text}."
-    if not parts:
+    if not parts:  # nothing was being built, so the settings are not the cause
         return None
     typed_parts = [part for part in parts if part.kind is not None]
     unexpected = _UNEXPECTED_ARGUMENT.search(text)
@@ -171,6 +173,7 @@ def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> st
     absent = _ABSENT_TYPE.match(text)
     if absent is not None and parts[0].registry is not None:
         registry = parts[0].registry
+        # `suggestion` starts with "; did you mean", and is empty if no name is similar.
         hint = suggestion(absent[1], names=registry_names(registry)) or "."
         return f"there is no {registry.name} of type {absent[1]!r}{hint}"
     subject = " of ".join(part.name for part in typed_parts) or "the run"
@@ -178,7 +181,9 @@ def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> st
     # name of the settings of the part.
     place = find_override(error) or _find_place(cfg, parts=parts)
     settings = f"these settings ({place})" if place else "these settings"
-    if type(error) is ValueError:  # raised by the checks of a library's class
+    # A check of arguments raises ValueError itself, and its message is enough. For other classes,
+    # also subclasses such as UnicodeDecodeError, the name of the class is added.
+    if type(error) is ValueError:
         return f"{subject} cannot be made from {settings}: {text}"
     return (
         f"{subject} cannot be made from {settings}: {type(error).__name__}: {text} "
@@ -191,6 +196,7 @@ def _find_place(cfg: Config, parts: list[_Part]) -> str | None:
     for part in parts:
         if isinstance(part.settings, dict):
             for name, settings in _sections(cfg, prefix=""):
+                # The part may have been built from a copy, so settings are compared by value.
                 if settings == part.settings:
                     return name
     return None
@@ -231,7 +237,7 @@ def _describe_unknown_setting(
     parts = [*parts, _Part(registry=None, kind=scope.get(target))]
     valid_names: list[str] = []
     for part in parts:
-        family = getattr(part.kind, "__mro__", (part.kind,))
+        family = getattr(part.kind, "__mro__", (part.kind,))  # a function has no base classes
         if any(getattr(member, "__name__", None) == target for member in family):
             valid_names = _argument_names(family, method=method)
             break
@@ -251,5 +257,6 @@ def _argument_names(family: tuple[Any, ...], method: str) -> list[str]:
         function = vars(member).get(method) if method else member
         code = getattr(function, "__code__", None)
         if code is not None:
+            # The arguments come first among the local variables.
             names += code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
     return names

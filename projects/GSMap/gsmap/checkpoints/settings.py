@@ -50,7 +50,7 @@ def differences(ours: Any, others: Any, name: str = "") -> dict[str, tuple[Any, 
     if not (isinstance(ours, Mapping) and isinstance(others, Mapping)):
         return {} if ours == others else {name: (ours, others)}
     unequal: dict[str, tuple[Any, Any]] = {}
-    for key in dict.fromkeys([*ours, *others]):
+    for key in dict.fromkeys([*ours, *others]):  # each key once, in a fixed order
         inner_name = f"{name}.{key}" if name else str(key)
         unequal |= differences(ours.get(key), others=others.get(key), name=inner_name)
     return unequal
@@ -78,7 +78,7 @@ def pipeline_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
         loader = cfg.get(f"{part}_dataloader") or {}
         pipeline = loader.get("dataset", {}).get("pipeline") or []
         for step in pipeline:
-            if isinstance(step, ConfigDict):
+            if isinstance(step, ConfigDict):  # mmengine also allows functions, without settings
                 steps.append(step)
     return steps
 
@@ -161,8 +161,11 @@ def _check_type(kind: Any, name: str, known: set[str]) -> Any:
         kind: Name of the type.
         name: Dotted name of the setting.
         known: Keys and strings of the config, which are allowed.
+
+    Raises:
+        ValueError: If the type is not registered or not trusted.
     """
-    if kind not in known:
+    if kind not in known:  # a type of the config is a current one
         kind = _REPLACEMENTS.get(kind, kind)
     registered_class = _find_registered(kind) if isinstance(kind, str) else None
     module = str(getattr(registered_class, "__module__", ""))
@@ -185,7 +188,7 @@ def _find_registered(kind: str) -> Any:
     """
     scope, _, bare_name = kind.rpartition(".")
     for registry in (MODELS, TASK_UTILS):
-        holders = [registry, registry.root]
+        holders = [registry, registry.root]  # registries that may hold the class
         if scope:
             holders += registry.root.children.values()
             holders = [holder for holder in holders if holder.scope == scope]

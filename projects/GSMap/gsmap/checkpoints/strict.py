@@ -51,6 +51,8 @@ def adapt_state(
 ) -> None:
     """Rename upstream keys in a state in place, and compare the state with the model.
 
+    Upstream keys are the names of weights in the code of a model's authors.
+
     Batch counters of BatchNorm may be missing, as in old checkpoints. Missing neutral weights are
     filled with the values of the model.
 
@@ -59,15 +61,18 @@ def adapt_state(
         expected: State of the model by key with ``prefix``.
         prefix: Prefix of all keys.
         neutral: Sets of keys that may be missing, all of a set together (`neutral_keys`).
-        fit: Function that changes the renamed state in place before the comparison.
-        allow_untrained: Whether neutral keys may be missing.
+        fit: Function of the model that changes the renamed state in place before the comparison,
+            or None.
+        allow_untrained: Whether neutral keys may be missing. If False, the state is filled as well
+            before the error is raised.
 
     Raises:
-        ValueError: If a key is missing or left over, or a weight has another shape.
+        ValueError: If a key is missing or left over, or a weight has another shape. Also if neutral
+            keys are missing although ``allow_untrained`` is False.
     """
     bare_state = {key.removeprefix(prefix): value for key, value in state.items()}
     if is_upstream(bare_state):
-        state.clear()
+        state.clear()  # the dictionary of the caller is filled with the renamed keys
         for key, value in ours_from_upstream(bare_state).items():
             state[prefix + key] = value
     if fit is not None:
@@ -78,7 +83,8 @@ def adapt_state(
     for keys in neutral:
         if keys <= absent:  # if only a part of the set is absent, this part counts as missing
             untrained += keys
-    untrained.sort()
+    untrained.sort()  # sets have no order, and the message names the first keys
+    # Batch counters may be absent.
     missing = {key for key in absent if not key.endswith("num_batches_tracked")}
     missing -= set(untrained)
     for key in untrained:

@@ -18,12 +18,13 @@ class Source:
     """Samples of one origin.
 
     Args:
-        samples: Samples.
-        frame: Annotation frame of the samples, ``lidar`` or ``ego``.
+        samples: Samples. An `AnnotationFile` reads each sample when it is accessed.
+        frame: Annotation frame of the samples, ``lidar`` (x right, y ahead) or ``ego`` (x ahead, y
+            left).
         data_root: Folder that image and LiDAR paths are relative to; None for the folder in the
             config.
         has_poses: Whether the pose of the vehicle is known.
-        notes: Messages of the reader for the user.
+        notes: Messages for the user from the code that has read the samples.
         ground_z_m: Height of the road in the frame in metres; None for the usual height.
     """
 
@@ -62,7 +63,7 @@ def open_annotations(path: str | Path, data_root: Path | None = None) -> Source:
     return Source(annotations, frame=meta.frame, data_root=data_root, ground_z_m=meta.ground_z_m)
 
 
-_HEIGHT_TOLERANCE_M = 1e-3
+_HEIGHT_TOLERANCE_M = 1e-3  # smaller differences of the height of the road are ignored
 
 
 def _shift_up(height_m: float) -> np.ndarray:
@@ -91,7 +92,9 @@ def usual_mount(frame: str, ground_z_m: float | None = None) -> np.ndarray:
     Returns:
         Transform in metres to the ground below the rear axle (x ahead, y left, z up). (4, 4)
     """
-    road_z_m = frame_view(frame, ground_z_m).ground[2]  # z of the road in the annotation frame
+    # The view of a frame contains its ground plane z = a x + b y + c as (a, b, c). The plane is
+    # level here, so c is z of the road in the annotation frame.
+    road_z_m = frame_view(frame, ground_z_m).ground[2]
     return _shift_up(-road_z_m) @ _NOMINAL[frame]
 
 
@@ -137,6 +140,7 @@ class Mount:
     @property
     def ego_from_frame(self) -> np.ndarray:
         """Transform from the frame to the vehicle in metres. (4, 4)"""
+        # `matrix` leads to the ground, whose height in the frame of the vehicle is then added.
         road_in_ego_m = frame_view(self.frame, self.ground_z_m).ego_ground_z_m
         return _shift_up(road_in_ego_m) @ self.matrix
 
@@ -169,12 +173,13 @@ def change_frame(
     Args:
         sample: Sample.
         frame: Annotation frame of the sample, ``lidar`` or ``ego``.
-        wanted: Annotation frame of the result. A name, ``lidar`` or ``ego``, selects the frame at
-            its usual place in the vehicle.
+        wanted: Annotation frame of the result: the `Mount` of a model, or a name, ``lidar`` or
+            ``ego``, for the frame at its usual place in the vehicle.
         ground_z_m: Height of the road in ``frame`` in metres; None for the usual height.
 
     Returns:
-        Sample in the new frame, without ground truth; ``sample`` if it needs no transformation.
+        Sample in the new frame, without ground truth, which is not transformed. If no
+        transformation is needed, ``sample`` itself with its ground truth.
     """
     mount = Mount(wanted) if isinstance(wanted, str) else wanted
     if mount.suits(frame, ground_z_m):
@@ -238,6 +243,7 @@ def sample_in_vehicle(
             ahead, y left, z up), in metres.
         global_from_ground: Pose of the ground frame in metres; None if it is not known. (4, 4)
     """
+    # The origin of the frame ``ego`` is at its usual height above the ground.
     ground_from_ego = usual_mount("ego")
     global_from_ground = np.eye(4) if global_from_ground is None else global_from_ground
     return MapSample(

@@ -54,6 +54,7 @@ class _Scene:
         self.rng = rng
         self.num_pieces = num_pieces
         self.finish_singles = finish_singles
+        # Pieces, or single frames as lists of one sample, that are not returned yet.
         self.waiting: deque[list[int]] = deque()
         self.has_singles = False  # whether ``waiting`` has single frames
 
@@ -74,8 +75,9 @@ class _Scene:
     def _draw_pieces(self) -> deque[list[int]]:
         """Cut the scene at random places and draw a random order of the pieces."""
         num_pieces = min(self.num_pieces, len(self.samples))
-        places = np.arange(1, len(self.samples))
-        cuts = self.rng.choice(places, size=num_pieces - 1, replace=False)
+        # A cut at k ends a piece before sample k. Every piece has at least one sample.
+        possible_cuts = np.arange(1, len(self.samples))
+        cuts = self.rng.choice(possible_cuts, size=num_pieces - 1, replace=False)
         pieces = np.split(np.array(self.samples), np.sort(cuts))
         order = self.rng.permutation(num_pieces)
         return deque(pieces[index].tolist() for index in order)
@@ -123,7 +125,7 @@ class StreamTrainSampler(Sampler[int]):
                 f"{slots}, {pieces}, {single_frame_iters}."
             )
         self.scenes = scenes_of(dataset)
-        self.rank, self.num_ranks = get_dist_info()
+        self.rank, self.num_ranks = get_dist_info()  # 0 and 1 if training is not distributed
         self.slots = slots
         self.pieces = pieces
         self.late_switch = late_switch
@@ -148,6 +150,7 @@ class StreamTrainSampler(Sampler[int]):
 
     def batches(self) -> Iterator[list[int]]:
         """Yield the batches of this rank from the first iteration of training, without end."""
+        # All streams of this rank share these scenes, so each piece goes to one stream only.
         scenes = []
         for number, samples in enumerate(self.scenes):
             rng = np.random.default_rng([self.seed, self.rank, number])
@@ -156,8 +159,8 @@ class StreamTrainSampler(Sampler[int]):
             )
             scenes.append(scene)
         first_stream = self.rank * self.slots
-        orders = []  # for each stream of this rank: its scenes, and its samples that wait
-        queues: list[deque[int]] = []
+        orders = []  # numbers of the scenes of each stream of this rank, without end
+        queues: list[deque[int]] = []  # samples of the current piece of each stream
         for slot in range(self.slots):
             orders.append(self._scene_order(first_stream + slot))
             queues.append(deque())
@@ -177,14 +180,15 @@ class StreamTrainSampler(Sampler[int]):
         previous = -1
         num_streams = self.slots * self.num_ranks
         for number in islice(self._permutations(), stream, None, num_streams):
-            if number != previous or len(self.scenes) == 1:
+            if number != previous or len(self.scenes) == 1:  # a single scene follows itself
                 yield number
                 previous = number
             else:
-                previous = -1  # the next number is not skipped
+                previous = -1  # no scene has this number, so the next one is not skipped
 
     def _permutations(self) -> Iterator[int]:
         """Yield the numbers of all scenes in random order, without end."""
+        # The seed contains no rank, so all ranks have equal permutations to share.
         rng = np.random.default_rng(self.seed)
         while True:
             yield from rng.permutation(len(self.scenes)).tolist()
@@ -209,6 +213,8 @@ class StreamTestSampler(Sampler[int]):
         rank, num_ranks = get_dist_info()
         num_samples = [0] * num_ranks
         self.scenes: list[list[int]] = []
+        # Each scene goes to the rank with the fewest samples. Short scenes come last, because they
+        # even out the differences that long scenes leave.
         longest_first = sorted(scenes_of(dataset), key=len, reverse=True)
         for scene in longest_first:
             least_loaded = num_samples.index(min(num_samples))
@@ -238,8 +244,8 @@ class StreamBatches(Sampler[list[int]]):
     def __init__(self, sampler: StreamTestSampler, batch_size: int) -> None:
         self.sampler = sampler
         self.batch_size = batch_size
-        waiting = deque(sampler.scenes)
-        active: list[deque[int]] = []
+        waiting = deque(sampler.scenes)  # scenes that have not begun
+        active: list[deque[int]] = []  # remaining samples of the scenes in the current batch
         self.batches: list[list[int]] = []
         while waiting or active:
             while waiting and len(active) < batch_size:

@@ -47,7 +47,7 @@ class RankWatch:
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_s = timeout_s
-        self._beat_s = min(5.0, timeout_s / 40)
+        self._beat_s = min(5.0, timeout_s / 40)  # time between two heartbeats, in seconds
         self._rank = dist.get_rank()
         self._ranks = dist.get_world_size()
         self._beats = 0
@@ -58,6 +58,7 @@ class RankWatch:
     def __enter__(self) -> "RankWatch":
         host = os.environ["MASTER_ADDR"]
         port = int(os.environ["MASTER_PORT"])
+        # A separate connection to the store of the run, which waits only shortly for an answer.
         answer_timeout = timedelta(seconds=self._beat_s)
         store = dist.TCPStore(host, port, is_master=False, timeout=answer_timeout)
         # The prefix keeps heartbeats from before a restart by torchrun from being read.
@@ -78,6 +79,7 @@ class RankWatch:
         self._name = name
 
     def _watch(self) -> None:
+        """Send heartbeats until the context ends, and check all ranks after a step without end."""
         self._beat()  # at once, because a rank may hang before the first wait ends
         while not self._ended.wait(self._beat_s):
             self._beat()
@@ -90,6 +92,7 @@ class RankWatch:
         description = f"process {os.getpid()} on {platform.node()}, at {self._name}"
         # An error means that the store does not answer, which `_end_if_stuck` reports.
         with suppress(RuntimeError):
+            # `_read_reports` splits this text at the first two spaces.
             self._store.set(f"{self._rank}", f"{self._beats} {self._steps} {description}")
 
     def _read_reports(self) -> dict[int, _Report]:
@@ -102,9 +105,9 @@ class RankWatch:
         for rank in (self._rank, *range(self._ranks)):  # first this rank, as a test of the store
             try:
                 text = self._store.get(f"{rank}").decode()
-            except RuntimeError:  # no answer in time
+            except RuntimeError:  # the rank has written nothing, or the store does not answer
                 missing = _Report(beats="", steps=0, description="not begun")
-                if rank == self._rank:
+                if rank == self._rank:  # this rank has written, so the store does not answer
                     return {0: missing}
                 reports[rank] = missing
             else:
@@ -120,7 +123,7 @@ class RankWatch:
             self._ended.wait(self._beat_s)
             self._beat()
         after = self._read_reports()
-        if self._steps != steps or self._ended.is_set():
+        if self._steps != steps or self._ended.is_set():  # this rank has gone on in the meantime
             return
         wait_s = time.monotonic() - self._step_start_s
         text = (
@@ -130,11 +133,20 @@ class RankWatch:
         )
         sys.stderr.write(f"error: {text}\n")
         sys.stderr.flush()
+        # The main thread waits in the collective operation and would not receive an exception.
         os._exit(BAD_INPUT)
 
 
 def _missing_ranks(before: dict[int, _Report], after: dict[int, _Report]) -> str:
-    """Describe the ranks without a new heartbeat, or else the ranks with the fewest steps."""
+    """Describe the ranks without a new heartbeat, or else the ranks with the fewest steps.
+
+    Args:
+        before: Reports of the ranks at the beginning of the check.
+        after: Reports after the time of some heartbeats.
+
+    Returns:
+        Clause for the message, such as "rank 1 (process ...) does not answer".
+    """
     silent_ranks = []
     for rank, report in after.items():
         previous_beats = before[rank].beats if rank in before else ""
@@ -146,7 +158,7 @@ def _missing_ranks(before: dict[int, _Report], after: dict[int, _Report]) -> str
         fewest_steps = min(all_steps)
         last_ranks = [rank for rank, report in after.items() if report.steps == fewest_steps]
     verb = "answer" if silent_ranks else "go on"
-    ranks = silent_ranks or last_ranks
+    ranks = silent_ranks or last_ranks  # silent ranks are named alone: the others wait for them
     if not ranks:
         return "no rank goes on"
     names = " and ".join(f"rank {rank} ({after[rank].description})" for rank in ranks)

@@ -14,7 +14,8 @@ from torch.optim import Optimizer
 
 from gsmap.utils.errors import InputError
 
-_PARTS = ("meta", "message_hub", "optimizer")
+_PARTS = ("meta", "message_hub", "optimizer")  # parts of a checkpoint that mmengine resumes from
+# Parts of the state of the message hub, in which mmengine stores logged values and the progress.
 _HUB_KEYS = ("log_scalars", "runtime_info", "resumed_keys")
 _SEED_COUNT = 2**32  # seeds that numpy accepts
 
@@ -76,7 +77,8 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
     """Require plausible values in an optimizer state, which torch loads without checks.
 
     Args:
-        state: State from the checkpoint, with the parameter groups of the optimizer.
+        state: State from the checkpoint. ``param_groups`` has the settings and the parameters of
+            each group; ``state`` has the entries of each parameter, such as its moments.
         optimizer: Optimizer of the run.
         path: File of the checkpoint, for the error.
 
@@ -86,7 +88,8 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
     """
     # `zip` is not strict: torch itself refuses a state with other numbers of groups or parameters.
     for group, run_group in zip(state["param_groups"], optimizer.param_groups, strict=False):
-        for name in run_group.keys() & group.keys() - {"params"}:
+        # ``params`` has the numbers of the parameters. The other keys are settings.
+        for name in run_group.keys() & (group.keys() - {"params"}):
             if not _is_compatible(group[name], reference=run_group[name]):
                 raise refusal(path, reason=f"its optimizer has {name} = {group[name]!r:.40}")
     # The state refers to parameters by number, in the order of the groups.
@@ -105,7 +108,8 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
 def _fits(value: Any, parameter: Tensor) -> bool:
     """Whether a value is a plausible entry of an optimizer's state for a parameter."""
     if isinstance(value, Tensor):
-        return value.shape in ((), parameter.shape) and bool(value.isfinite().all())
+        has_valid_shape = value.shape in ((), parameter.shape)  # () for a count of steps
+        return has_valid_shape and bool(value.isfinite().all())
     return value is None or _is_number(value)
 
 
@@ -125,7 +129,7 @@ def _is_compatible(value: Any, reference: Any) -> bool:
         if not isinstance(value, list | tuple) or len(value) != len(reference):
             return False
         return all(map(_is_compatible, value, reference))
-    if isinstance(reference, int | float) and value is not None:
+    if isinstance(reference, int | float):
         return _is_number(value)
     if reference is None:
         return value is None or isinstance(value, str | int | float | Tensor)
@@ -136,11 +140,12 @@ def _progress_fault(meta: Mapping[str, Any], runner: Runner) -> str:
     """Return the fault of the epoch, the iteration or the seed; empty if there is none."""
     loop = runner.train_loop
     if isinstance(loop, EpochBasedTrainLoop):
-        limits = {"epoch": loop.max_epochs, "iter": None}
+        limits = {"epoch": loop.max_epochs, "iter": None}  # None: not limited
     else:
         limits = {"epoch": None, "iter": loop.max_iters}
     for name, limit in limits.items():
         value = meta.get(name)
+        # `isinstance` would accept a bool. Counts are 64-bit integers.
         if type(value) is not int or not 0 <= value < 2**63:
             return f"its {name} is {value!r:.40}"
         if limit is not None and value > limit:
@@ -181,6 +186,8 @@ def _schedule_fault(states: Any, runner: Runner) -> str:
     replace a method.
     """
     schedules = runner.param_schedulers
+    # mmengine has a dict of schedulers in place of a list if a training has several optimizers.
+    # Their states are not checked.
     if states is None or not isinstance(schedules, list):
         return ""
     if not isinstance(states, list) or not all(isinstance(state, Mapping) for state in states):

@@ -47,7 +47,7 @@ class MapRunner(Runner):
     the run ends within ``env_cfg.dist_cfg.timeout`` (`RankWatch`).
     """
 
-    _watch: RankWatch | None = None
+    _watch: RankWatch | None = None  # watch of all ranks; None for a single rank
 
     @master_only
     def dump_config(self) -> None:
@@ -84,6 +84,7 @@ class MapRunner(Runner):
                 settings to lower.
         """
         try:
+            # A failed write, as on a full disk, is reported with the work folder.
             with add_path_to_errors(Path(self.work_dir)), self._watch_ranks():
                 return super().train()
         except FloatingPointError as error:
@@ -132,6 +133,7 @@ class MapRunner(Runner):
         if self.world_size == 1:
             yield
             return
+        # `call_hook` reports the steps of this rank to the watch.
         with RankWatch(rank_timeout_s(self.cfg)) as self._watch:
             yield
 
@@ -149,6 +151,7 @@ def _divergence_advice(runner: Runner) -> str:
         start = "again"
         load_from = ""
     group = runner.optim_wrapper.param_groups[0]
+    # Rate at the start of the schedule; only a schedule stores ``initial_lr``.
     learning_rate = group.get("initial_lr", group["lr"])
     uses_amp = isinstance(runner.optim_wrapper, (AmpOptimWrapper, CPUAutocastOptimWrapper))
     amp_advice = " or without --amp" if uses_amp else ""
@@ -169,6 +172,7 @@ class RunSummaryHook(Hook):
         if runner.iter:
             start = f"goes on after iteration {runner.iter}"
         else:
+            # `_load_from` is the checkpoint of the setting ``load_from``, or None.
             source = runner._load_from or "the config's initial weights"
             start = f"from {source}"
         device = next(model.parameters()).device
@@ -226,7 +230,8 @@ def _describe_data(runner: Runner) -> dict[str, str]:
     # `dataset` is now the last one of the loop. The cameras and the map are equal in all of them.
     if not hasattr(dataset, "sample"):
         return lines
-    cameras = dataset.sample(0).cameras
+    cameras = dataset.sample(0).cameras  # records of the first sample
+    # Without a selection in the config, `dataset.cameras` is None: all cameras are used.
     names = dataset.cameras or [camera.name for camera in cameras]
     sizes = sorted({f"{camera.width} x {camera.height}" for camera in cameras})
     meta = dataset.metainfo
@@ -253,7 +258,7 @@ def _missed_elements_warning(runner: Runner, model: Any) -> str | None:
     if not groups or not hasattr(innermost(runner.train_dataloader.dataset), "annotations"):
         return None
     counts = _element_counts(runner.train_dataloader)
-    queries = groups[0].num  # the first group predicts
+    queries = groups[0].num  # only the first group is used in prediction
     excess = np.maximum(counts - queries, 0)
     if not excess.any():
         return None

@@ -12,8 +12,8 @@ import sys
 from gsmap.utils.interrupt import leave_at_once_on_ctrl_c
 
 if __name__ == "__main__":
-    # The import of torch takes seconds, during which Ctrl-C must end the process at once. Later,
-    # torchrun sets its handler.
+    # The import of torch takes seconds, during which Ctrl-C must end the process at once. torchrun
+    # later replaces this handler.
     leave_at_once_on_ctrl_c()
 # isort: split
 from torch.distributed.elastic.multiprocessing import SignalException
@@ -23,7 +23,7 @@ from torch.distributed.run import main
 from gsmap.utils.cli import END_SIGNALS
 from gsmap.utils.parallel import LAUNCHER
 
-INTERRUPTED = 128 + signal.SIGINT
+INTERRUPTED = 128 + signal.SIGINT  # exit code of a process that Ctrl-C has ended
 STOP_TIMEOUT_S = 30  # torchrun ends ranks with SIGTERM, and after this time with SIGKILL
 
 
@@ -35,9 +35,11 @@ def _cause(error: ChildFailedError) -> tuple[int, ProcessFailure]:
     are first, then interrupted ranks, then ranks that ended with an error, because a rank that
     loses its peers ends with an error.
     """
+    # By rank: its exit code, which is the negative number of a signal that killed it, and its time.
     first_s = min(failure.timestamp for failure in error.failures.values())
 
     def order(rank: int) -> tuple[bool, bool, bool, float, int]:
+        """Sort key of a rank. The cause is the rank with the smallest key."""
         failure = error.failures[rank]
         code = failure.exitcode
         # Whole seconds need a tolerance of one second.
@@ -86,18 +88,21 @@ def reason(error: ChildFailedError) -> tuple[str, int]:
 
 
 if __name__ == "__main__":
-    for part in ("agent.server.api", "multiprocessing.api"):  # torch sets a level for each logger
-        logging.getLogger(f"torch.distributed.elastic.{part}").setLevel(logging.CRITICAL)
+    # These loggers would print long reports of a failure around the one-line error. They are set
+    # one by one, because torch sets a level for each logger.
+    for module in ("agent.server.api", "multiprocessing.api"):
+        logging.getLogger(f"torch.distributed.elastic.{module}").setLevel(logging.CRITICAL)
     os.environ[LAUNCHER] = str(os.getpid())  # the ranks end when the process with this ID ends
-    # The caller may have blocked these signals, and the ranks inherit the mask.
+    # The caller may have blocked the signals that end a run (SIGINT, SIGTERM and SIGHUP). The ranks
+    # inherit the set of blocked signals.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, END_SIGNALS)
     try:
-        main()
+        main()  # starts the ranks and returns when all of them have ended
     except Exception as error:
         stopped_by = signal_behind(error)
         if stopped_by is not None:  # the ranks receive this signal too, and rank 0 reports it
             sys.exit(128 + signal.Signals(stopped_by.sigval))
-        if not isinstance(error, ChildFailedError):
+        if not isinstance(error, ChildFailedError):  # not a failure of a rank
             raise
         text, code = reason(error)
         sys.stderr.write(f"error: {text}\n")

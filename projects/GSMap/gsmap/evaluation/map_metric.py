@@ -60,7 +60,7 @@ class MapMetric(BaseMetric):
         for name in eval:
             metric_class(name)  # raises an error for an unknown name
         self.eval = tuple(eval)
-        self.thresholds = checked_thresholds(thresholds)
+        self.thresholds = checked_thresholds(thresholds)  # in ascending order
         self.out_file = out_file
 
     def _meta(self, key: str) -> Any:
@@ -85,12 +85,16 @@ class MapMetric(BaseMetric):
         return MapEvaluator.from_names(self.eval, settings)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
-        """Match the samples of one batch.
+        """Match the samples of one batch, and store a record of each sample.
+
+        A record has the ``token``, the ``matches`` if metrics are computed, and the ``vectors``
+        (elements in MapTR's JSON form) if a file is written.
 
         Args:
             data_batch: Not used.
             data_samples: Samples with ``token``, ``pred_instances_3d`` and, unless ``eval`` is
-                empty, ``eval_ann_info``, in the form of ``datasets/elements.py``.
+                empty, ``eval_ann_info``, the ground truth. ``datasets/elements.py`` defines and
+                reads their form.
 
         Raises:
             ValueError: If predictions are malformed or ground truth is missing.
@@ -116,14 +120,17 @@ class MapMetric(BaseMetric):
             self.results.append(record)
 
     def evaluate(self, size: int) -> dict[str, float]:
-        """Collect the records of all ranks and compute the metrics of a data set of ``size``."""
+        """Collect the records of all ranks and compute the metrics of a data set of ``size``.
+
+        Only the first rank computes. The others receive its figures.
+        """
         self._size = size
         # `BaseMetric` would cut the records of all ranks to the length of the shortest rank, but
         # ranks that predict whole drives have different numbers of records.
         parts: list[list[dict[str, Any]]] = all_gather_object(self.results)  # type: ignore[has-type]
         self.results = list(chain.from_iterable(parts))
-        # `BaseMetric` would also cut the joined list at `size`. Here, tokens identify the repeated
-        # samples, so nothing may be cut.
+        # `BaseMetric` collects the joined lists again, and would cut them at `size`. Nothing may be
+        # cut here, because `compute_metrics` finds repeated samples by their tokens.
         return super().evaluate(sys.maxsize)
 
     def compute_metrics(self, results: list[dict[str, Any]]) -> dict[str, float]:
@@ -133,7 +140,7 @@ class MapMetric(BaseMetric):
             results: Records of all samples of all ranks; samples may be repeated.
 
         Returns:
-            Figures by their flat keys.
+            Figures by their flat keys, such as ``chamfer/mAP``.
         """
         # A sampler repeats samples to fill the last batch of a rank. The first record of a sample
         # counts: in reversed order, it is the last one to be written to the dict.
@@ -152,11 +159,12 @@ class MapMetric(BaseMetric):
             MMLogger.get_current_instance().info("\n%s", format_table(report))
         if self.out_file is not None:  # written last, so that a full disk loses no figures
             samples = ((record["token"], record["vectors"]) for record in records)
-            meta = {"classes": list(self._meta("classes"))}
+            file_meta = {"classes": list(self._meta("classes"))}
+            # The origin of the predictions: splits of the data, checkpoint, fit of the sigmas.
             for key in (SPLIT_LIST, TRAINED_ON, CHECKPOINT, CALIBRATION):
                 if self.dataset_meta.get(key):
-                    meta[key] = self.dataset_meta[key]
-            write_results(self.out_file, samples=samples, meta=meta)
+                    file_meta[key] = self.dataset_meta[key]
+            write_results(self.out_file, samples=samples, meta=file_meta)
             text = f"Results of {len(records)} samples written to {self.out_file}"
             print_log(text, logger="current")
         return flat_metrics(reports)

@@ -28,8 +28,8 @@ class LossCheck:
     """Check of losses that raises an error if a loss is not finite.
 
     On a CPU, the error is raised in the step of the loss, on a GPU in the next step: the result is
-    copied to the host while the step continues, and `finish` waits for it. A copy of the object has
-    no pending check.
+    copied to the host while the step continues, and `finish` waits for it. A copied or unpickled
+    object has no pending check, because the event that `LateValues` waits for belongs to the step.
     """
 
     def __init__(self) -> None:
@@ -52,6 +52,7 @@ class LossCheck:
         self.finish()
         scalars = []
         for loss in losses.values():
+            # Losses may have one axis of length 1, and different types.
             scalars.append(loss.detach().float().reshape(()))
         values = torch.stack(scalars)
         self._pending = PendingCheck(
@@ -69,7 +70,7 @@ class LossCheck:
         if self._pending is None:
             return
         check = self._pending
-        self._pending = None
+        self._pending = None  # before the error, so that it is raised once
         bad = []
         flags = check.is_finite.read().tolist()
         for name, is_finite in zip(check.names, flags, strict=True):

@@ -17,14 +17,17 @@ import gsmap.utils.compilation  # noqa: F401 - logs that kernels are compiled
 
 SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filling this many
 
-# Options of the compiler. A sum may be reordered, so that it is computed in vector lanes. The order
-# is fixed when a kernel is compiled, so that results are repeatable. Options under which NaN and
-# infinity lose their meaning are left out.
+# Options of the compiler. With "reassoc", a sum may be reordered, so that it is computed in vector
+# lanes. The order is fixed when a kernel is compiled, so that results are repeatable. The others
+# allow fused multiply-add, any sign of zero, and multiplication by a reciprocal in place of a
+# division. Options under which NaN and infinity lose their meaning are left out.
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
 def run_in_threads(kernel: Callable[..., None], pixels: int, *arguments: Any) -> None:
     """Run a kernel on slices of the instances, one slice per torch thread.
+
+    Kernels are compiled with ``nogil``, so Python threads run them in parallel.
 
     One thread computes an instance from start to end, so the result does not depend on the number
     of threads. Threads are started for each call and end with it. A forked process therefore never
@@ -58,7 +61,7 @@ def run_in_threads(kernel: Callable[..., None], pixels: int, *arguments: Any) ->
         jobs = [pool.submit(run, bounds[i], bounds[i + 1]) for i in range(1, workers)]
         run(bounds[0], bounds[1])  # the first slice, in the calling thread
         for job in jobs:
-            job.result()
+            job.result()  # raises the error of a slice
 
 
 @njit(inline="always")
@@ -75,6 +78,7 @@ def pixel_range(low, high, origin, step, size):  # type: ignore[no-untyped-def]
     Returns:
         Index of the first pixel, and one past the index of the last.
     """
+    # The centre of pixel i is at origin + (i + 0.5) * step.
     first = (low - origin) / step - 0.5
     last = (high - origin) / step - 0.5
     # `first` is limited to [0, size] and `last` to [-1, size - 1], so the range of an interval

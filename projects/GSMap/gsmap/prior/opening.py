@@ -8,7 +8,7 @@ from gsmap.prior.gaussian_prior import GaussianPrior
 from gsmap.prior.map_prior import MapPrior
 
 AnyPrior = MapPrior | GaussianPrior | ElementPrior
-"""Priors that a model reads."""
+"""Priors that a model reads: a raster of the classes, Gaussians, or map elements."""
 
 
 def open_prior(path: str | Path, update: bool = False) -> AnyPrior:
@@ -23,14 +23,15 @@ def open_prior(path: str | Path, update: bool = False) -> AnyPrior:
         The prior. `MapPrior.close` releases its file; other kinds of priors reserve no file.
 
     Raises:
+        FileNotFoundError: If the file does not exist.
         ValueError: If the file is not a valid prior.
-        RuntimeError: If the file is reserved by another process.
+        RuntimeError: If the file is to be reserved, and another process has reserved it.
     """
     path = Path(path)
     with path.open("rb") as file:
-        magic = file.read(len(GAUSSIAN_MAGIC))
+        magic = file.read(len(GAUSSIAN_MAGIC))  # all kinds have a mark of this length
     if magic == GAUSSIAN_MAGIC:
         return GaussianPrior.load(path)
     if magic == ELEMENT_MAGIC:
         return ElementPrior.load(path)
-    return MapPrior.load(path, update=update)
+    return MapPrior.load(path, update=update)  # refuses a file that is no prior

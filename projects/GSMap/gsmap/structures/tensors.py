@@ -15,7 +15,7 @@ from gsmap.utils.errors import InputError
 _ALIGNMENT = 64  # bytes, at least the alignment that any type or kernel needs
 _LARGE = 2**20  # bytes; tensors of this size or more are copied separately
 _MOST_CONSTANTS = 4096  # per process; further constants are not cached
-_constants: dict[Hashable, Tensor] = {}
+_constants: dict[Hashable, Tensor] = {}  # by device and key, see `cached_constant`
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
@@ -54,7 +54,7 @@ def constant(like: Tensor, values: Any, dtype: torch.dtype | None = None) -> Ten
         Tensor, shared by all callers: it must not be written to.
     """
     dtype = dtype or like.dtype
-    if _is_traced(like):
+    if _is_traced(like):  # a trace must contain the numbers, not a cached tensor
         return like.new_tensor(values, dtype=dtype)
     key = _hashable(values)
     return cached_constant(like, ("values", key, dtype), lambda: like.new_tensor(key, dtype=dtype))
@@ -96,19 +96,21 @@ def upload(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
 
     Args:
         tensors: Tensors of any shapes and types.
-        device: Device of the copies. If it is the host, tensors are returned as they are.
+        device: Device of the copies. If it is the host, tensors that are already there are returned
+            as they are.
 
     Returns:
-        Contiguous tensors on the device.
+        Tensors on the device, contiguous unless the device is the host.
     """
     if device.type == "cpu":
         return [tensor.to(device) for tensor in tensors]
-    pinned = device.type == "cuda"
+    pinned = device.type == "cuda"  # only copies from pinned memory run in the background
     copies: list[Tensor] = []
     ranges: dict[int, slice] = {}  # bytes of the block that a small tensor takes
     end = 0
     for index, tensor in enumerate(tensors):
         size = tensor.numel() * tensor.element_size()
+        # An empty tensor has no bytes in the block, so it is copied separately.
         if tensor.device.type == "cpu" and 0 < size < _LARGE:
             ranges[index] = slice(end, end + size)
             end += -(-size // _ALIGNMENT) * _ALIGNMENT  # rounded up to the alignment
@@ -117,12 +119,12 @@ def upload(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
         source = tensor.pin_memory() if pinned and size else tensor
         copies.append(source.to(device, non_blocking=True).contiguous())
     block = torch.empty(end, dtype=torch.uint8, pin_memory=pinned)
-    for index, place in ranges.items():
-        part = block[place].view(tensors[index].dtype)
+    for index, byte_range in ranges.items():
+        part = block[byte_range].view(tensors[index].dtype)  # its bytes as numbers of this type
         part.view(tensors[index].shape).copy_(tensors[index])
     block = block.to(device, non_blocking=True)
-    for index, place in ranges.items():
-        part = block[place].view(tensors[index].dtype)
+    for index, byte_range in ranges.items():
+        part = block[byte_range].view(tensors[index].dtype)
         copies[index] = part.view(tensors[index].shape)
     return copies
 
@@ -136,7 +138,7 @@ class LateValues:
 
     def __init__(self, values: Tensor) -> None:
         self._host = values.detach().to("cpu", non_blocking=True)
-        self._arrival = None
+        self._arrival = None  # event of the GPU at the end of the copy; None on other devices
         if values.is_cuda:
             self._arrival = torch.cuda.Event()
             self._arrival.record(torch.cuda.current_stream(values.device))
@@ -192,6 +194,7 @@ def check_same_shape(**both: Tensor) -> None:
     Args:
         both: The two tensors. Their keywords are their names in the message.
     """
+    # Keyword arguments keep their order.
     (first_name, first), (name, second) = both.items()
     if first.shape != second.shape:
         raise InputError(
@@ -218,7 +221,7 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
 
 
 def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
-    """Address and version of each tensor of a module, to detect changes of its values.
+    """Address and version of each parameter and buffer of a module, to detect changes of values.
 
     A change in place raises the version of a tensor. Tensors that were made in inference mode have
     no version, and get 0.

@@ -10,7 +10,8 @@ from gsmap.structures.calibration import NUM_CAN_BUS
 
 Pose = tuple[float, NDArray[np.floating[Any]]]
 """Time in seconds, and transform from the vehicle to the world at that time in metres (4, 4)."""
-_GRAVITY = np.array([0.0, 0.0, 9.81])  # measured by an accelerometer at rest
+# Upward acceleration in m/s^2 that an accelerometer measures at rest, in the world.
+_GRAVITY = np.array([0.0, 0.0, 9.81])
 
 
 def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -22,10 +23,12 @@ def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float
     Returns:
         Position (3) in metres and orientation (w, x, y, z) in the world; acceleration (3) with
         gravity in m/s^2, rotation rate (3) in rad/s and velocity (3) in m/s, all in the frame of
-        the vehicle; yaw in the world in radians, and in degrees in [0, 360). (18,)
+        the vehicle; yaw in the world in radians, and in degrees in [0, 360). The acceleration, the
+        rotation rate and the velocity are zero. (18,)
     """
     values = np.zeros(NUM_CAN_BUS)
     values[:3] = global_from_ego[:3, 3]
+    # The tolerances are for the test of the matrix: it must be a rotation except for rounding.
     values[3:7] = Quaternion(matrix=global_from_ego, atol=1e-6, rtol=1e-6).elements
     yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
     values[16] = np.radians(yaw_deg)
@@ -34,7 +37,7 @@ def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float
 
 
 def pose_only_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Compute signals from a pose like MapTR's code for Argoverse 2.
+    """Compute the signals of MapTR's code for Argoverse 2 from a pose.
 
     All entries of acceleration, rotation rate and velocity are 1, because Argoverse 2 has no
     measurements of them.
@@ -55,6 +58,9 @@ def motion_signals(
 ) -> NDArray[np.float64]:
     """Compute signals from poses: `pose_signals`, with the motion from differences of the poses.
 
+    If neither an earlier nor a later pose is given, the rotation rate and the velocity are zero.
+    Unless both are given, the acceleration is gravity alone.
+
     Args:
         now: Pose at the time of the signals.
         before: Earlier pose of the drive, or None.
@@ -68,16 +74,18 @@ def motion_signals(
     start, first = before or now
     end, last = after or now
     values = pose_signals(pose)
-    ego_from_global = pose[:3, :3].T
+    ego_from_global = pose[:3, :3].T  # rotation only, for vectors without a position
     acceleration = _GRAVITY
     if end > start:
+        # Rotation of the vehicle from the start to the end, in its frame at the start.
         rotation = Quaternion(matrix=first[:3, :3].T @ last[:3, :3], atol=1e-6, rtol=1e-6)
         rotation_rate = rotation.axis * rotation.radians / (end - start)
         values[10:13] = rotation_rate
         velocity = ego_from_global @ (last - first)[:3, 3] / (end - start)
         values[13:16] = velocity
     if end > time > start:
-        # Mean velocities of both intervals, whose centres are half of (end - start) apart.
+        # Mean velocities of both intervals. The centres of the intervals are (end - start) / 2
+        # apart. The acceleration is the difference of the velocities, divided by this time.
         velocity_before = (pose - first)[:3, 3] / (time - start)
         velocity_after = (last - pose)[:3, 3] / (end - time)
         acceleration = _GRAVITY + 2 * (velocity_after - velocity_before) / (end - start)

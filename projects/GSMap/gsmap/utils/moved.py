@@ -46,6 +46,7 @@ def _successors() -> dict[str, tuple[str, ...]]:
     successors: dict[str, tuple[str, ...]] = {}
     for name in _BASE_MODULES:
         successors[f"{_MAPTR}.{name}"] = (f"{_BASE}.{name}",)
+    # The contents of these two modules were divided among two modules each.
     successors[f"{_MAPTR}.attention"] = (f"{_BASE}.attention", f"{_MAPTR}.self_attention")
     successors[f"{_MAPTR}.matching"] = (f"{_BASE}.matching", f"{_MAPTR}.cost")
     for package, names in _EVALUATION.items():
@@ -59,7 +60,12 @@ MOVED: Mapping[str, tuple[str, ...]] = MappingProxyType(_successors())
 
 
 class MovedModules(MetaPathFinder, Loader):
-    """Importer of modules by their former names, with the contents of the modules in `MOVED`."""
+    """Importer of modules by their former names, with the contents of the modules in `MOVED`.
+
+    An instance in ``sys.meta_path`` is an import hook. If no earlier hook has found a module,
+    Python calls `find_spec`. From the returned spec it makes an empty module, which `exec_module`
+    fills.
+    """
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -84,5 +90,6 @@ class MovedModules(MetaPathFinder, Loader):
         for successor in MOVED[module.__name__]:
             contents = vars(import_module(successor))
             for name, value in contents.items():
+                # Names such as `__name__` and `__file__` describe the module itself.
                 if not name.startswith("__"):
                     setattr(module, name, value)

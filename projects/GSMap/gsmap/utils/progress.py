@@ -7,7 +7,9 @@ from tqdm import tqdm
 
 from gsmap.utils.terminal import unescaped_stream
 
+# Options of ``tqdm``: shortest and longest time between two updates, in seconds.
 _EVERY_MINUTE = {"mininterval": 60.0, "maxinterval": 60.0}
+# Formats of a line, whose fields ``tqdm`` fills in: title, count, total, unit and elapsed time.
 _FORMAT = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed}"
 _UNKNOWN_TOTAL = "{desc}{n_fmt} {unit}, {elapsed}"
 
@@ -24,7 +26,7 @@ class Progress(tqdm):
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        if not sys.stderr.isatty():
+        if not sys.stderr.isatty():  # a file or a pipe
             title = f"{kwargs['desc']}: " if kwargs.get("desc") else ""
             kwargs |= _EVERY_MINUTE
             kwargs |= {"desc": title, "bar_format": _FORMAT, "file": _Lines(sys.stderr)}
@@ -36,7 +38,10 @@ class Progress(tqdm):
 
     @property
     def format_dict(self) -> dict[str, Any]:
-        """Values that fill the format of a line. The format omits an unknown total."""
+        """Values that ``tqdm`` fills into the format of a line, and the format itself.
+
+        The format of a line omits an unknown total.
+        """
         values: dict[str, Any] = super().format_dict
         if values["bar_format"] == _FORMAT and values["total"] is None:
             values["bar_format"] = _UNKNOWN_TOTAL
@@ -44,7 +49,14 @@ class Progress(tqdm):
 
 
 class _Lines:
-    """Stream that writes each update of a progress bar as a line."""
+    """Stream that writes each update of a progress bar as a line.
+
+    ``tqdm`` begins an update with a carriage return, to overwrite the previous one, and fills it up
+    with spaces. Both are removed.
+
+    Args:
+        file: File or pipe to write to.
+    """
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

@@ -17,8 +17,8 @@ from gsmap.utils.extras import import_extra
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.shards import without_options
 
-_POLL_S = 1.0
-_RETRIES = 5
+_POLL_S = 1.0  # longest time to wait for a result before the late shards are looked at
+_RETRIES = 5  # further tries of a shard after a signal, or after a failure of its worker or node
 
 
 class ShardKilledError(Exception):
@@ -49,6 +49,7 @@ def run_on_ray(
     """
     if arguments.shards < 1 or arguments.shard.count:
         raise InputError("--executor needs --shards N of at least 1, and no --shard I/N.")
+    # Ray is an optional dependency. The error for a missing module names the command to install it.
     ray = import_extra(module="ray", extra="ray")
     if not ray.is_initialized():
         ray.init(log_to_driver=False, include_dashboard=False)
@@ -76,15 +77,17 @@ def _without_cluster_options(words: Sequence[str]) -> list[str]:
     ``--per-shard`` is followed by any number of words ``NAME=AMOUNT``, where NAME is a resource of
     Ray: ``num_cpus``, ``num_gpus`` or ``memory``.
     """
-    rest: list[str] = []
+    shard_words: list[str] = []
     is_resource = False
+    # `without_options` removes options with one value each, so --per-shard is removed here.
     for word in without_options(words, "--executor", "--shards"):
         name, _, _ = word.partition("=")
+        # A word NAME=AMOUNT is removed if it follows --per-shard or another removed word.
         follows_resource = is_resource and name.startswith(("num_", "memory"))
         is_resource = name == "--per-shard" or follows_resource
         if not is_resource:
-            rest.append(word)
-    return rest
+            shard_words.append(word)
+    return shard_words
 
 
 def _run_shard(words: Sequence[str], shard: str, folder: str) -> tuple[str, float]:
@@ -96,7 +99,10 @@ def _run_shard(words: Sequence[str], shard: str, folder: str) -> tuple[str, floa
         folder: Working folder of the command.
 
     Returns:
-        The failure, empty on success, and the duration in seconds.
+        Description of the failure, empty on success, and the duration in seconds.
+
+    Raises:
+        ShardKilledError: If the process was ended by a signal. Ray then tries the shard again.
     """
     start_s = time.perf_counter()
     process = subprocess.run(
@@ -105,10 +111,12 @@ def _run_shard(words: Sequence[str], shard: str, folder: str) -> tuple[str, floa
         capture_output=True,
         text=True,
         errors="replace",
+        # The command ends with the worker of Ray, for example when Ray cancels the task.
         preexec_fn=partial(die_with_parent, os.getpid()),
     )
     code = process.returncode
-    if code < 0 or code >= 128:  # a shell returns 128 plus the number of the signal
+    # Python returns the negative number of a signal, and a shell 128 plus the number.
+    if code < 0 or code >= 128:
         raise ShardKilledError(f"shard {shard} was killed: exit code {code}")
     duration_s = time.perf_counter() - start_s
     if not code:
@@ -144,7 +152,7 @@ class _Run:
     repeated: int = 0
 
     def run_all(self) -> list[str]:
-        """Run all shards, and return the failures."""
+        """Run all shards, and return a description of each shard that failed."""
         # Index of the shard of each task of Ray that is running.
         running = {self._start(index): index for index in range(self.count)}
         restarted: set[int] = set()  # shards that were started a second time
@@ -155,7 +163,7 @@ class _Run:
             ready, _ = self.ray.wait(list(running), num_returns=1, timeout=_POLL_S)
             for task in ready:
                 index = running.pop(task)
-                failure = self._result(task)
+                failure = self._result(task)  # empty on success
                 has_second_task = index in running.values()  # a second run, which may still succeed
                 if index in finished or (failure and has_second_task):
                     continue
@@ -173,7 +181,7 @@ class _Run:
             limit_s = max(self.patience_s, 2 * longest_s)
             if room_since_s is not None and now_s - room_since_s > limit_s:
                 late = set(running.values()) - restarted
-                restarted |= late
+                restarted |= late  # a shard is started a second time only once
                 self.repeated += len(late)
                 for index in late:
                     running[self._start(index)] = index
@@ -192,7 +200,8 @@ class _Run:
         task = self.ray.remote(_run_shard).options(
             max_retries=_RETRIES,
             retry_exceptions=[ShardKilledError],
-            scheduling_strategy="SPREAD",
+            scheduling_strategy="SPREAD",  # over all nodes
+            # Nodes do not have the environment of this process.
             runtime_env={"env_vars": {"PYTHONPATH": os.environ.get("PYTHONPATH", "")}},
             **options,
         )

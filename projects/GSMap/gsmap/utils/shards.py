@@ -21,7 +21,8 @@ from gsmap.utils.inputs import require_own_file
 
 Items = TypeVar("Items", bound=Sequence[Any])
 
-_SHARED_ENTRIES = ("kind", "target", "of", "version", "input", "options")  # equal for all shards
+# Entries of a manifest that are equal for all shards of a file (see `Shard.write_manifest`).
+_SHARED_ENTRIES = ("kind", "target", "of", "version", "input", "options")
 _ENTRY_TYPES = {  # types of the entries of a manifest
     "kind": str,
     "target": str,
@@ -84,7 +85,8 @@ class Shard:
         Args:
             target: Path of the complete file. For `WHOLE`, nothing is checked, because the user has
                 chosen this path.
-            mark: Bytes at the start or at the end of each file of this kind.
+            mark: Bytes near the start or near the end of each file of this kind, by which a shard
+                of an earlier run is recognised. Such a file may be replaced.
 
         Raises:
             ValueError: If another program's file has the name of the shard or of its manifest.
@@ -92,6 +94,7 @@ class Shard:
         if self.count:
             path = self.path_of(target)
             require_own_file(path, mark)
+            # `kind` is the first entry of every manifest.
             require_own_file(_manifest_path(path), mark=b'"kind":')
 
     def write_manifest(
@@ -183,16 +186,19 @@ def without_options(words: Sequence[str], *names: str) -> list[str]:
     Args:
         words: Words of the command.
         *names: Options to remove, given as ``--option VALUE`` or ``--option=VALUE``.
+
+    Returns:
+        The remaining words of the command.
     """
-    rest = []
+    remaining_words = []
     previous = ""
     for word in words:
         option, _, _ = word.partition("=")
         follows_option = previous in names  # the word is the value of an option to remove
         if not follows_option and option not in names:
-            rest.append(word)
+            remaining_words.append(word)
         previous = word
-    return rest
+    return remaining_words
 
 
 def digest(path: Path) -> str:
@@ -224,6 +230,7 @@ def read_shard(path: Path) -> ShardFile:
     manifest_path = _manifest_path(path)
     try:
         manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
+        # Types are compared exactly, because `isinstance` would accept True as a number.
         wrong_names = [
             name for name, kind in _ENTRY_TYPES.items() if type(manifest[name]) is not kind
         ]
@@ -262,8 +269,10 @@ def find_shards(target: Path) -> list[ShardFile]:
         ValueError: If a shard is damaged, does not match its file name, or differs from the others
             in the number of shards, the options, the input or the version.
     """
+    # Wildcards in the name of the file itself have no meaning.
     pattern = f"{glob.escape(target.stem)}.*-of-*{glob.escape(target.suffix)}.manifest"
     manifest_paths = sorted(target.parent.glob(pattern))
+    # `with_suffix` removes `.manifest`, and leaves the path of the shard.
     shards = [read_shard(path.with_suffix("")) for path in manifest_paths]
     if not shards:
         raise FileNotFoundError(f"there are no shards of {target}: --shard I/N makes them.")
@@ -290,6 +299,7 @@ def find_shards(target: Path) -> list[ShardFile]:
 
 
 def _manifest_path(path: Path) -> Path:
+    """Path of the manifest of a shard, from the path of the shard."""
     return path.with_name(f"{path.name}.manifest")
 
 

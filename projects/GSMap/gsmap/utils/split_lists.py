@@ -13,9 +13,10 @@ from typing import Any
 from gsmap.utils.errors import InputError
 
 SPLIT_LIST = "split_list"  # key in annotation files, checkpoints and results
-# Key in results: list by which the training data of the model were split. It is only written if the
-# model was trained on the data set that it was tested on.
+# Key in results: identity of the list by which the training data of the model were split. It is
+# only written if the model was trained on the data set that it was tested on, such as nuScenes.
 TRAINED_ON = "trained_on"
+# A name, and a digest of 16 hexadecimal digits. Identities without a digest are accepted.
 _IDENTITY = re.compile(r"[\w.+=-]{1,100}(@[0-9a-f]{16})?")
 
 
@@ -26,6 +27,7 @@ def list_identity(name: str, scenes: Mapping[str, Collection[str]]) -> str:
         name: Name of the list.
         scenes: Names of the scenes in each part of the split, in any order.
     """
+    # The digest depends on the scenes of each part, but not on any order.
     sorted_scenes = {part: sorted(names) for part, names in scenes.items()}
     text = json.dumps(sorted_scenes, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()
@@ -63,7 +65,7 @@ def require_same_list(model: Any, data: Any, subject: str, remedy: str) -> None:
         remedy: Option that allows another split, for the message.
 
     Raises:
-        ValueError: If both lists are known and differ.
+        ValueError: If both lists are known and differ, or if an identity is malformed.
     """
     model_identity = checked_identity(model)
     data_identity = checked_identity(data)
@@ -83,11 +85,13 @@ def require_results_of(split_list: str, about: Mapping[str, Any], path: object) 
 
     Args:
         split_list: Identity of the list of the evaluation data; empty if unknown.
-        about: Metadata of the result file.
+        about: Metadata of the result file, in which both keys may be missing: the list of the
+            training and the list of the predicted data.
         path: Result file, for the message.
 
     Raises:
-        ValueError: If both lists are known and differ.
+        ValueError: If a list of the results and ``split_list`` are known and differ, or if an
+            identity is malformed.
     """
     for name in (TRAINED_ON, SPLIT_LIST):
         require_same_list(

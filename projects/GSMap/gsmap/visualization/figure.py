@@ -28,6 +28,8 @@ from gsmap.visualization.style import FALSE_DASHES, MATCH_COLOURS, TRUTH_OPACITY
 DPI = 220
 """Dots per inch: text of 6.5 points is legible in a picture that is displayed 800 px wide."""
 _WIDTH = 1500  # width of the layout in px at DPI
+# Options of Matplotlib by format. Metadata have no date, because it would differ between the files
+# of equal figures.
 _SAVE_OPTIONS: dict[str, dict[str, Any]] = {
     "png": {"metadata": {"Software": "gsmap"}, "pil_kwargs": {"compress_level": 4}},
     "jpg": {"pil_kwargs": {"quality": 92}},
@@ -46,7 +48,7 @@ _PNG_IN_SVG = re.compile(rb"data:image/png;base64,([\w+/=\s]+)")
 _RANDOM_TOKEN = re.compile(r"[0-9a-f]{16,}")
 # Numbers with four or more decimals, of which two are kept. Factors in scale(...) do not match.
 _LONG_NUMBER = re.compile(rb"(?<!scale\()\b(\d+\.\d\d)\d{2,}")
-_TALLEST = 0.5 * _USABLE  # largest height of a row of cameras or a panel
+_TALLEST = 0.5 * _USABLE  # largest height of a row of cameras or a panel, in px at DPI
 _LONGEST_TITLE = 88  # characters
 
 Box = tuple[float, float, float, float]  # left, top, width, height in px, from the top left corner
@@ -114,7 +116,7 @@ def _layout(
         offset = _GAP * (len(rows) - 1) - sum(_GAP * (len(row) - 1) / sum(row) for row in rows)
         frame_height = _TITLE + _TICKS  # above and below the panel
         # Part of the total width that does not depend on the width of the cameras: the labels
-        # beside the panel, and the constant part of the panel's width.
+        # beside the panel with a margin, and the constant part of the panel's width.
         fixed_width = 1.3 * _TICKS + aspect * (offset - frame_height)
         camera_width = (_USABLE - fixed_width) / (1 + aspect * slope)
         camera_boxes, bottom = _camera_boxes(rows, camera_width)
@@ -140,7 +142,7 @@ def _add_axes(figure: Figure, box: Box) -> Axes:
     """Add axes in a box of the layout."""
     left, top, width, height = box
     bottom = figure.get_figheight() * DPI - top - height
-    scale = np.tile(figure.get_size_inches() * DPI, 2)
+    scale = np.tile(figure.get_size_inches() * DPI, 2)  # width, height, width, height of the figure
     # Matplotlib takes shares of the figure's width and height, from the bottom left corner.
     shares = np.array([left, bottom, width, height]) / scale
     return figure.add_axes(tuple(shares))
@@ -152,7 +154,7 @@ def _legend_lines(
     """Legend entries of all classes and kinds of matches in a figure."""
     labels: set[int] = set()
     for elements in maps:
-        if elements:
+        if elements:  # neither None nor empty
             labels.update(elements.labels.tolist())
     lines = []
     for label in sorted(labels):
@@ -188,7 +190,7 @@ def _draw_header(figure: Figure, title: str, lines: Sequence[Line2D], style: Map
         loc="center left",
         bbox_to_anchor=(margin, 1 - 0.75 * _HEADER / height),
         ncols=max(len(lines), 1),
-        fontsize=round(min(8, 800 / max(num_letters, 1)), 1),
+        fontsize=round(min(8, 800 / max(num_letters, 1)), 1),  # all entries fit in one row
         labelcolor=style.ink,
         frameon=False,
         borderpad=0,
@@ -239,13 +241,14 @@ def compose_figure(
     camera_boxes, panel_boxes, bottom = _layout(
         camera_aspects, num_panels=len(panels), aspect=panel_aspect
     )
+    # The layout is in px at DPI. Another number of dots per inch scales the whole figure.
     size_in = (_WIDTH / DPI, (bottom + _MARGIN / 2) / DPI)
     scale = width_px / _WIDTH
     figure = Figure(figsize=size_in, dpi=DPI * scale, facecolor="white")
     maps = [camera_elements, *(panel.elements for panel in panels)]
     legend = _legend_lines(maps, panels=panels, style=style)
     _draw_header(figure, title=title, lines=legend, style=style)
-    for camera, box in zip(chain(*rows), camera_boxes, strict=True):
+    for camera, box in zip(chain.from_iterable(rows), camera_boxes, strict=True):
         _, _, width, height = box
         draw_camera(
             _add_axes(figure, box),
@@ -289,7 +292,8 @@ def sample_name(metainfo: Mapping[str, Any], suffix: str) -> str:
     """Create a file name that sorts by scene and time and ends in the last letters of the token.
 
     The last letters are unique only in tokens that are random hexadecimal numbers of 16 digits or
-    more. For other tokens, a digest of the token is appended.
+    more. For other tokens, a digest of the token is appended. Without ``seconds``, the name is the
+    token alone.
 
     Args:
         metainfo: Metadata with ``scene``, ``seconds`` since the start of the scene, and ``token``.
@@ -304,6 +308,7 @@ def sample_name(metainfo: Mapping[str, Any], suffix: str) -> str:
         return file_name(token) + suffix
     scene = metainfo.get("scene") or "scene"
     name = file_name(f"{scene}_{seconds:07.2f}s_{token[-8:]}")
+    # The name has the last 8 letters, which are all of a short token.
     if len(token) > 8 and not _RANDOM_TOKEN.fullmatch(token):
         digest = hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
         name += f"-{digest[:8]}"
@@ -343,6 +348,7 @@ def _compress_svg(svg: bytes) -> bytes:
     """Reduce the size of an SVG by half: images as JPEG, two decimals, fewer blanks."""
     svg = _PNG_IN_SVG.sub(_jpeg_from_png, svg)
     svg = _LONG_NUMBER.sub(rb"\1", svg)
+    # Remove the blanks and line breaks around the letters of path commands (move, line, curve).
     return re.sub(rb" \n([MLC]) ", rb"\1", svg)
 
 

@@ -2,6 +2,9 @@
 
 Geometry that does not depend on the pose of the vehicle is prepared once per log; each frame then
 takes a few vectorised geometry calls. ``docs/data.md`` lists both sets of rules.
+
+The position of a lane is its index in the list of the lanes of the map. The patch is the rectangle
+around the vehicle to which the map is cut.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -29,7 +32,7 @@ from mapdata.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 COMPAT_MODES = ("maptrv2", "maptr")
 DEFAULT_RULES = COMPAT_MODES[0]
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
-# Values in place of the position of a neighbouring lane.
+# Values in place of the position of a lane's neighbour.
 NO_LANE = -2  # the lane has no neighbour on this side
 OUTSIDE = -1  # the neighbour is not in the map
 
@@ -71,7 +74,8 @@ class Argoverse2Map:
 
     Args:
         static_map: Map of the official API.
-        left_out: Ids of the unusable elements of the map's file, by kind and reason.
+        left_out: Ids of the unusable elements of the map's file, by a text with their kind and the
+            reason.
     """
 
     def __init__(
@@ -79,6 +83,7 @@ class Argoverse2Map:
     ) -> None:
         self.left_out = dict(left_out or {})
         lanes = static_map.get_scenario_lane_segments()
+        # For each lane, pairs of positions: a lane and the lane that follows it.
         links = link_lanes([(lane.id, lane.predecessors, lane.successors) for lane in lanes])
         self._add_neighbours(lanes, links)
         lane_polygons = []
@@ -91,6 +96,8 @@ class Argoverse2Map:
             for marking in (lane.left_lane_marking, lane.right_lane_marking):
                 if marking.mark_type is not LaneMarkType.NONE:  # an unknown mark counts as paint
                     painted_lines.append(shapely.LineString(marking.polyline))
+        # A `GeometryLayer` finds its valid geometries that touch a patch. `LanePaths` joins the
+        # lines of consecutive lanes to paths.
         self._lanes = GeometryLayer(lane_polygons)
         self._is_intersection = np.array([lane.is_intersection for lane in lanes], dtype=bool)
         self._centre_paths = LanePaths(centrelines, links)
@@ -107,9 +114,10 @@ class Argoverse2Map:
     def _add_neighbours(self, lanes: Sequence[LaneSegment], links: LaneLinks) -> None:
         """Prepare the left and the right lines of the lanes, and the lanes beyond these lines."""
         position = {lane.id: i for i, lane in enumerate(lanes)}
-        # Both lists have an entry for the left side, then one for the right side.
+        # Both lists have two entries, for the left and for the right side.
         self._side_paths = []
-        self._neighbours = []  # position of each lane's neighbour on this side. each (lanes,)
+        # Position of each lane's neighbour, NO_LANE or OUTSIDE. (lanes,) each
+        self._neighbours = []
         for side in ("left", "right"):
             lines = []
             neighbours = []
@@ -135,7 +143,7 @@ class Argoverse2Map:
             ValueError: If the log has several maps, or the map is damaged.
         """
         path = find_map(log_dir)
-        with explain_errors(path, "download it again"):
+        with explain_errors(path, "download it again"):  # adds the path and this advice to errors
             static_map, left_out = read_map_file(path)
             return cls(static_map, left_out)
 
@@ -169,7 +177,8 @@ class Argoverse2Map:
             Vertices of each element in metres, ego frame, by class. Each (n, 3).
 
         Raises:
-            ValueError: If a class or the rules are unknown, or the pose is malformed.
+            ValueError: If a class or the rules are unknown, the pose is malformed, or there are too
+                many paths through the lanes.
         """
         check_rules(classes, compat)
         pose = np.asarray(city_from_ego, dtype=np.float64)
@@ -200,7 +209,7 @@ class Argoverse2Map:
             if compat == "maptr":
                 return self._painted_lines(patch)
             return self._dividers(patch, lanes)
-        if compat == "maptr":
+        if compat == "maptr":  # the class is "ped_crossing"
             return self._crossing_rings(patch)
         return self._merged_crossings(patch)
 
@@ -232,6 +241,7 @@ class Argoverse2Map:
 
     def _painted_lines(self, patch: LocalPatch) -> np.ndarray:
         """Painted lane boundaries, joined where the lines meet (MapTR)."""
+        # `clip_lines` returns the parts inside the patch, in the ego frame.
         return merge_until_stable(clip_lines(self._painted.near(patch), patch))
 
     def _merged_crossings(self, patch: LocalPatch) -> np.ndarray:

@@ -21,6 +21,7 @@ from mapdata.folders.rig import PoseTrack, RigCamera, rotation_of
 from mapdata.paths import path_below
 
 NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
+# Keys of a file and of each of its cameras, which docs/inference.md describes.
 _KEYS = {"cameras", "ground_z_m", "poses", "rate_hz", "max_time_difference_ms"}
 _CAMERA_KEYS = {
     "images", "intrinsics", "distortion", "distortion_model", "vehicle_from_camera", "position_m",
@@ -42,13 +43,15 @@ def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]
             ``ground_z_m``. (4, 4)
 
     Returns:
-        The cameras, each with the value of its key ``images`` (the topic in a bag), and the pose of
-        the road. (4, 4)
+        The cameras, each with the value of its key ``images`` (the topic in a bag, empty without
+        the key), and the pose of the road. (4, 4)
 
     Raises:
+        FileNotFoundError: If there is no such file.
         ValueError: If the file is malformed; the message names the camera.
     """
     rig = []
+    # Adds the name of the file and the remedy to the message of an error, as a ValueError.
     with explain_errors(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
         if "ground_z_m" in content:
@@ -70,7 +73,7 @@ def read_vehicle(
 
     Args:
         file: Calibration file. The path of its ``poses`` is relative to its folder.
-        images: Images by the camera's name; other cameras of the file are left out.
+        images: Images by the camera's name. Cameras of the file without images are left out.
         time_of: Times of the images in nanoseconds, by their names without suffix.
 
     Returns:
@@ -123,7 +126,7 @@ def _construct_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _read_values(file: Path) -> Any:
-    """Parse the values of a calibration file, within bounds."""
+    """Parse a calibration file, within limits of the file size and of the number of values."""
     if file.stat().st_size > _MOST_BYTES:
         raise InputError(f"it has more than {_MOST_BYTES} bytes, which no calibration takes")
     text = read_text(file)
@@ -198,6 +201,10 @@ def read_named_poses(
 
     Returns:
         Poses of the road below the vehicle; None if the file names no poses.
+
+    Raises:
+        FileNotFoundError: If there is no file of poses.
+        ValueError: If the path leads out of the folder, or the file of poses is malformed.
     """
     if not content.get("poses"):
         return None
@@ -220,7 +227,8 @@ def create_camera(
         The camera.
 
     Raises:
-        ValueError: If a value is malformed.
+        ValueError: If a value is malformed. Missing keys and values of a wrong type raise the
+            errors of Python, such as a KeyError, which the callers convert by `explain_errors`.
     """
     intrinsics = np.array(camera["intrinsics"], dtype=np.float64)
     if intrinsics.shape == (4,):
@@ -232,7 +240,7 @@ def create_camera(
     return RigCamera(
         name=name,
         intrinsics=intrinsics,
-        cam_from_ground=invert_rigid(_vehicle_from_camera(camera)) @ ground,
+        cam_from_ground=invert_rigid(_vehicle_from_camera(camera)) @ ground,  # through the vehicle
         size_px=(int(width), int(height)),
         distortion=np.array(camera.get("distortion", ()), dtype=np.float64),
         model=str(camera.get("distortion_model", "")),
@@ -249,14 +257,16 @@ def _size_of(images: Sequence[Path], where: str) -> tuple[int, int]:
 
 def _vehicle_from_camera(camera: Mapping[str, Any]) -> np.ndarray:
     """Transform from a camera (right, down, ahead) to the vehicle (ahead, left, up). (4, 4)"""
-    keys = {"vehicle_from_camera", "quaternion_wxyz", "yaw_pitch_roll_deg"} & set(camera)
-    if len(keys) != 1:
+    # Each of these keys gives the rotation, so exactly one of them is needed.
+    rotation_keys = {"vehicle_from_camera", "quaternion_wxyz", "yaw_pitch_roll_deg"} & set(camera)
+    if len(rotation_keys) != 1:
         raise InputError(
             "say its place by vehicle_from_camera (4 x 4), or by position_m with either "
-            f"quaternion_wxyz or yaw_pitch_roll_deg; got {sorted(keys) or 'none of them'}"
+            f"quaternion_wxyz or yaw_pitch_roll_deg; got {sorted(rotation_keys) or 'none of them'}"
         )
     if "vehicle_from_camera" in camera:
         pose = np.array(camera["vehicle_from_camera"], dtype=np.float64)
+        # `is_rigid` also refuses a mirroring matrix. The first test gives it a message of its kind.
         if pose.shape == (4, 4) and np.linalg.det(pose[:3, :3]) < 0:
             raise InputError(
                 "vehicle_from_camera mirrors (its rotation's determinant is below 0): two axes are "
@@ -266,8 +276,10 @@ def _vehicle_from_camera(camera: Mapping[str, Any]) -> np.ndarray:
             raise InputError("vehicle_from_camera must be a rotation with a translation, 4 x 4")
         return pose
     if "quaternion_wxyz" in camera:
-        rotation = rotation_of(camera["quaternion_wxyz"])
+        rotation = rotation_of(camera["quaternion_wxyz"])  # from camera axes to vehicle axes
     else:
+        # The angles turn a camera that looks ahead: yaw about z, then pitch about the new y, then
+        # roll about the new x.
         turn = Rotation.from_euler("ZYX", camera["yaw_pitch_roll_deg"], degrees=True)
         rotation = turn.as_matrix() @ _AHEAD
     return rigid(rotation, translation=camera["position_m"])

@@ -22,7 +22,7 @@ from gsmap.utils.files import write_text
 from gsmap.utils.words import format_count
 from mapdata.nuscenes.tables import pose_of, read_table
 
-LIMITS = (10, 20)  # limits between the groups, per cent of the map
+LIMITS = (10, 20)  # limits between the groups, hidden share of the map in per cent
 _NEAR_M = 0.3  # smallest depth of a visible point
 _STEP_M = 1.0  # distance between the sampled points of a map
 
@@ -60,8 +60,8 @@ def read_boxes(folder: Path, tokens: Collection[str]) -> dict[str, Boxes]:
     for record in read_table(folder, "sample_annotation"):
         token = record["sample_token"]
         if token in poses:
-            width, length, height = record["size"]
-            poses[token].append(pose_of(record))
+            width, length, height = record["size"]  # metres; the x axis is along the length
+            poses[token].append(pose_of(record))  # global_from_box (4, 4)
             halves_m[token].append(np.array([length, width, height]) / 2)
     if not any(poses.values()):
         raise InputError(
@@ -70,6 +70,7 @@ def read_boxes(folder: Path, tokens: Collection[str]) -> dict[str, Boxes]:
         )
     boxes = {}
     for token in poses:
+        # The shapes are given for samples without boxes.
         global_from_box = np.array(poses[token]).reshape(-1, 4, 4)
         halves = np.array(halves_m[token]).reshape(-1, 3)
         boxes[token] = Boxes(invert_rigid(global_from_box), halves)
@@ -91,9 +92,12 @@ def cuts_sight(origin: Array, points: Array, boxes: Boxes) -> NDArray[np.bool_]:
     """
     rotations = boxes.box_from_global[:, :3, :3]
     translations = boxes.box_from_global[:, :3, 3]
+    # The camera, and the vectors from the camera to the points, in the frame of each box.
     start = np.einsum("bij,j->bi", rotations, origin) + translations  # (B, 3)
     direction = np.einsum("bij,nj->nbi", rotations, points - origin)  # (n, B, 3)
-    with np.errstate(divide="ignore", invalid="ignore"):  # lines parallel to a slab
+    # The direction of a line parallel to a slab has a component of 0. The quotients are infinite,
+    # or NaN for a line in a side of the box. Comparisons with NaN are false: no hit.
+    with np.errstate(divide="ignore", invalid="ignore"):
         to_lower = (-boxes.halves_m - start) / direction  # (n, B, 3)
         to_upper = (boxes.halves_m - start) / direction  # (n, B, 3)
     crossings = np.stack([to_lower, to_upper])  # fractions of the segment. (2, n, B, 3)
@@ -172,8 +176,10 @@ def hidden_share(sample: MapSample, boxes: Boxes) -> float:
         global_from_cam = global_from_frame @ invert_rigid(camera.cam_from_frame)
         origin = global_from_cam[:3, 3]
         is_in_image[inside] = True
+        # Whether any box is between this camera and each point in its image.
         is_hidden = cuts_sight(origin, global_points[inside], boxes=boxes).any(axis=1)
         is_visible[inside] |= ~is_hidden
+    # A point is visible if at least one camera has a free line of sight to it.
     num_hidden = (is_in_image & ~is_visible).sum()
     num_in_image = is_in_image.sum()
     return float(num_hidden / max(num_in_image, 1))
@@ -186,6 +192,7 @@ def word_for(share: float, limits: Sequence[int] = LIMITS) -> str:
         share: Hidden share in [0, 1].
         limits: Ascending limits between the groups, per cent, between 0 and 100.
     """
+    # Find the first upper limit above the share. A share of 1 belongs to the last group.
     low = 0
     for high in (*limits, 100):
         if 100 * share < high or high == 100:
@@ -211,11 +218,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> str:
     """Write the group of each sample to a JSON file.
 
+    Args:
+        arguments: Parsed options of `add_arguments`.
+
     Returns:
         Sizes of the groups as text.
 
     Raises:
-        ValueError: If the limits do not ascend, or the file has no ground truth.
+        FileNotFoundError: If the annotation file or the table of boxes is missing.
+        ValueError: If the limits do not ascend, the file has no ground truth, or the table is
+            damaged or has no box of the samples.
     """
     limits = arguments.limits
     if any(low >= high for low, high in pairwise((0, *limits, 100))):

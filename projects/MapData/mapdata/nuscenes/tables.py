@@ -54,6 +54,7 @@ def _has_kind(value: Any, kind: type | int) -> bool:
     """Whether a value has the type of a field, or is a list of ``kind`` finite numbers.
 
     The kind ``list`` is a matrix of camera intrinsics (3, 3), or an empty list for other sensors.
+    Types are compared exactly, because a bool is also an ``int`` in Python.
     An integer must fit into 64 bits after a conversion from microseconds to nanoseconds. Four
     numbers must be a unit quaternion.
     """
@@ -118,7 +119,9 @@ def read_table(folder: Path, table: str) -> Iterator[dict[str, Any]]:
     if not path.is_file():
         raise FileNotFoundError(f"no table at {path}: download the tables again.")
     fields: dict[str, type | int] = {"token": str, **_FIELDS[table]}
+    # The file is a list of records (key None), which is read without loading the whole file.
     for record, _ in items_of(path, None, "download it again"):
+        # A record that is no object has no fields, so the first field is reported.
         values = record if isinstance(record, dict) else {}
         for name, kind in fields.items():
             value = values.get(name)
@@ -142,7 +145,7 @@ class NuScenesTables:
     Args:
         version: Name of the folder of the tables, such as ``v1.0-trainval``.
         dataroot: Data root.
-        max_sweeps: Number of earlier LiDAR sweeps per sample.
+        max_sweeps: Largest number of earlier LiDAR sweeps per sample; 0 keeps key frames only.
         frame: Annotation frame, ``lidar`` or ``ego``.
 
     Attributes:
@@ -161,10 +164,12 @@ class NuScenesTables:
         self._max_sweeps = max_sweeps
         # Messages of the CAN bus by scene; only the latest scene is kept.
         self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))
+        # Records of each table by token. A table is stored after the tables that it refers to.
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
         for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
             self._store(table, read_table(self._folder, table))
         self.cameras, self.lidar = self._sensor_channels()
+        # A list, because the records are also needed to select poses and to fill `data`.
         sample_data = list(self._read_sample_data())
         pose_tokens = {record["ego_pose_token"] for record in sample_data}
         poses = read_table(self._folder, "ego_pose")
@@ -242,8 +247,10 @@ class NuScenesTables:
         key_frame_channels = {self.lidar, *self.cameras}
         names = ("token", *_FIELDS["sample_data"])
         for record in read_table(self._folder, "sample_data"):
+            # `_store` checks all links later, but the channel is needed first.
             self._check_link("sample_data", record, name="calibrated_sensor_token")
             channel = self._channel_of(record)
+            # Sweeps include the key frames of the LiDAR.
             is_sweep = channel == self.lidar and self._max_sweeps > 0
             is_key_frame = record["is_key_frame"] and channel in key_frame_channels
             if is_sweep or is_key_frame:
@@ -351,7 +358,11 @@ class NuScenesTables:
     def _camera(
         self, name: str, data: dict[str, Any], global_from_frame: np.ndarray
     ) -> CameraRecord:
-        """Make the camera of a ``sample_data`` record."""
+        """Make the camera of a ``sample_data`` record.
+
+        The vehicle moves between the times of LiDAR and camera, so the transform goes through the
+        global frame.
+        """
         global_from_cam, calibration = self._global_from_sensor(data)
         return CameraRecord(
             name=name,
@@ -414,7 +425,7 @@ def read_nuscenes(
     for scene in tables.scene:
         for record in tables.samples_of(scene):
             total += 1
-            if tables.lidar in record["data"]:
+            if tables.lidar in record["data"]:  # the key frames of the sample, by channel
                 samples.append(tables.read(record, scene))
     note = (
         f"{len(samples)} of {format_count(total, 'sample')} used: the others have no key frame of "

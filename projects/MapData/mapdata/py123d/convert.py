@@ -1,4 +1,8 @@
-"""Conversion of py123d logs to an annotation file with pinhole cameras and the frame ``ego``."""
+"""Conversion of py123d logs to an annotation file with pinhole cameras and the frame ``ego``.
+
+The origin of ``ego`` is the centre of the rear axle, with x ahead, y left and z up. A record is the
+dictionary of one frame from which `mapdata.custom.create_samples` makes a sample.
+"""
 
 import argparse
 import itertools
@@ -24,7 +28,7 @@ from mapdata.py123d.log import REMEDY, SYNC, Log
 from mapdata.py123d.map import Map
 from mapdata.summary import ConversionSummary
 
-_GROUND_TOLERANCE_M = 0.05
+_GROUND_TOLERANCE_M = 0.05  # largest difference of the heights of the road in the logs of one file
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Py123dOptions(FileOptions):
         y_range: Smallest and largest y (left) of the ground truth, in metres.
     """
 
-    _: KW_ONLY
+    _: KW_ONLY  # the fields below are keyword-only, so `split` may follow fields with defaults
     split: str
     data_root: Path | None = None
     rate_hz: float | None = 2.0
@@ -84,6 +88,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
         raise WorkError(f"no log is left of {options.split}:\n{summary.text()}")
     data_root = options.data_root or options.root
     target = options.path_of("py123d", options.split)
+    # This call converts one shard of the logs: all of them if `shard.count` is 0.
     shard_logs = options.shard.part(logs)
     meta = options.meta(
         dataset=file_name(f"py123d_{logs[0].metadata.get('dataset')}"),
@@ -99,6 +104,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
         if first is None and not options.shard.count:
             raise WorkError(f"no sample is left of {options.split}:\n{summary.text()}")
         all_records = records if first is None else itertools.chain([first], records)
+        # `join`: lines of a class whose ends meet become one line.
         samples = create_samples(all_records, meta, root=data_root, join=True)
         write_annotations(target, meta, samples, shard=options.shard)
     path = options.shard.path_of(target)
@@ -161,7 +167,7 @@ def _all_records(
     for log in logs:
         try:
             path = log.map_file(options.root)
-            if path is not None and path not in maps:
+            if path is not None and path not in maps:  # None for a log without a map
                 if not path.is_file():
                     raise FileNotFoundError(f"no map at {path}: {REMEDY}.")
                 maps = {path: Map(path, options.classes)}
@@ -179,7 +185,11 @@ def _all_records(
 def _records(
     log: Log, log_map: Map | None, options: Py123dOptions, summary: ConversionSummary
 ) -> Iterator[dict[str, Any]]:
-    """Yield the records of a log; frames that cannot be used are counted and left out."""
+    """Yield the records of a log; frames that cannot be used are counted and left out.
+
+    Raises:
+        ValueError: If the log has no usable camera, or one of its tables is damaged.
+    """
     # For each time in nanoseconds, the row of the image in the table of each camera.
     frames = {}
     for time_ns, rows in log.frames():  # the row is None for a camera without an image
@@ -192,13 +202,14 @@ def _records(
             summary.add_problem(reason, f"{log.name}_{time_ns // 1000}")
         else:
             frames[time_ns] = known_rows
-    # The map is cut around the vehicle, as far as the farthest corner of the range.
+    # Elements are taken as far from the vehicle as the farthest corner of the range, so that the
+    # range is covered at any yaw. `create_samples` clips them to the range.
     largest_x_m, largest_y_m = np.abs([options.x_range, options.y_range]).max(axis=1)
     radius_m = float(np.hypot(largest_x_m, largest_y_m))
     root = options.data_root or options.root
     for time_ns in thin_out(np.array(sorted(frames), np.int64), options.rate_hz).tolist():
         token = f"{log.name}_{time_ns // 1000}"
-        global_from_imu = log.track.at(time_ns)
+        global_from_imu = log.track.at(time_ns)  # None if no pose is near this time
         if global_from_imu is None:
             summary.add_problem("frame left out: no pose near its time", token)
             continue
@@ -231,7 +242,7 @@ def _cameras(
 
     Args:
         log: The log.
-        rows: Row of the image by camera.
+        rows: Row of the image in the camera's table, by the name of the camera.
         global_from_axle: Pose of the frame ``ego`` at the time of the frame. (4, 4)
         root: Data root of the images.
 

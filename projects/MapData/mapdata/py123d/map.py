@@ -15,7 +15,7 @@ from mapdata.py123d.log import REMEDY
 from mapdata.py123d.packed import unpack
 
 CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
-# Numbers of layers in py123d.
+# Numbers of layers in py123d. A layer contains the objects of one kind.
 _LANE = 0
 _CROSSWALK = 3
 _ROAD_EDGE = 8
@@ -52,6 +52,7 @@ class Map:
         self.lines: list[np.ndarray] = []
         self.labels: list[int] = []
         self.left_out = 0
+        # Errors about the content get the name of the file and the remedy.
         with explain_errors(path, REMEDY):
             table = read_table(path, columns=["map_layer", "features", "wkb"])
             layers = table["map_layer"].to_numpy()
@@ -68,7 +69,8 @@ class Map:
         Args:
             label: Index of the class.
             name: Name of the class.
-            item: Row of the table.
+            item: Row of the table: ``wkb``, the geometry as well-known binary, and ``features``, a
+                dictionary of attributes packed as MessagePack.
         """
         if name == "divider" and unpack(item["features"])["road_line_type"] == _NO_PAINT:
             return
@@ -100,8 +102,9 @@ class Map:
         low = point - radius_m
         high = point + radius_m
         square = shapely.box(xmin=low[0], ymin=low[1], xmax=high[0], ymax=high[1])
-        numbers = np.sort(self._tree.query(square, predicate="intersects")).tolist()
-        return [{"label": self.labels[i], "points": self.lines[i]} for i in numbers]
+        # The tree returns indices in no fixed order.
+        indices = np.sort(self._tree.query(square, predicate="intersects")).tolist()
+        return [{"label": self.labels[i], "points": self.lines[i]} for i in indices]
 
 
 def _vertices(wkb: bytes) -> np.ndarray:

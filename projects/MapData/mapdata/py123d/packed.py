@@ -9,8 +9,8 @@ import pyarrow as pa
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
-_ARRAY = b"__ndarray__"
-_DTYPES = ("<f4", "<f8")
+_ARRAY = b"__ndarray__"  # key that marks a dictionary as an array; py123d writes keys as bytes
+_DTYPES = ("<f4", "<f8")  # float32 and float64 in little-endian order
 
 
 def unpack(content: bytes) -> Any:
@@ -20,6 +20,7 @@ def unpack(content: bytes) -> Any:
         ValueError: If the content is damaged, or an array is not float32 or float64.
     """
     msgpack = import_extra("msgpack", "py123d")
+    # The hook is called for each dictionary, the inner ones first.
     return msgpack.unpackb(content, object_hook=_array_of)
 
 
@@ -43,6 +44,7 @@ def metadata_of(table: pa.Table) -> dict[str, Any]:
     Raises:
         ValueError: If the table has no metadata of py123d.
     """
+    # Arrow's metadata is None if it is empty. Its keys and values are bytes.
     content = (table.schema.metadata or {}).get(b"metadata")
     metadata = None if content is None else unpack(content)
     if not isinstance(metadata, dict):

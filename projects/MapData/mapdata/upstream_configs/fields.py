@@ -5,7 +5,7 @@ from typing import Any
 
 from gsmap.utils.errors import InputError
 
-_REQUIRED = object()
+_REQUIRED = object()  # default of a setting that must exist, as None may be a value
 
 
 class Fields:
@@ -22,10 +22,14 @@ class Fields:
         self._values = values
 
     def section(self, name: str) -> dict[str, Any]:
-        """Look up the settings below a name; an empty dict if there are no such settings.
+        """Look up the settings below a name.
 
         Args:
             name: Dotted name, such as ``model.pts_bbox_head``.
+
+        Returns:
+            The dict in the config itself, not a copy, so that entries can be removed from it. An
+            empty dict if the name does not exist or is not the name of a dict.
         """
         value: Any = self._values
         for key in name.split("."):
@@ -54,10 +58,10 @@ class Fields:
         return values.pop(key, default)
 
     def items(self, name: str) -> list[str]:
-        """List the dotted names of the items of a list.
+        """List the dotted names of the items of a list, such as ``data.train.pipeline.0``.
 
         Args:
-            name: Dotted name of the list.
+            name: Dotted name of the list, with at least one dot.
 
         Raises:
             ValueError: If the setting is missing or not a list.
@@ -102,7 +106,7 @@ class Fields:
         values = self.section(section)
         for name in names.split():
             values.pop(name, None)
-        for name, value in fixed.items():
+        for name, value in fixed.items():  # any other value remains, and is reported as left over
             if values.get(name) == value:
                 values.pop(name)
 
@@ -117,6 +121,8 @@ class Fields:
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
     """Yield dotted name and value of each leaf of nested dicts and lists of dicts.
+
+    Other lists are leaves. Empty dicts and lists have no leaves.
 
     Args:
         value: Dict, list or leaf.

@@ -13,8 +13,10 @@ from gsmap.structures.elements import MAX_LENGTH_M
 from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
 
+# Fields whose value may be missing (null in the file).
 _OPTIONAL = {"lidar", "can_bus", "instances", "ego_from_frame"}
-# Words before the names of fields in messages.
+# For a column or field with nested fields: words before the names of these fields in messages. The
+# suffix ``[]`` stands for the items of a list.
 _PREFIXES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}
 # Paths that are empty or absolute, have backslashes or control characters, or have a part "..".
 _OUTSIDE = r"^$|^/|[\\\x00-\x1f]|(^|/)\.\.(/|$)"
@@ -58,7 +60,7 @@ class _BatchChecker:
             array: Array of a column or a field.
             name: Name of the column or field; with ``[]`` for items of a list.
             rows: For each item, the index of its sample in the batch. (items,)
-            where: Beginning of messages.
+            where: Beginning of messages, such as "camera's "; empty for columns.
 
         Raises:
             ValueError: If a value is wrong or missing.
@@ -72,10 +74,11 @@ class _BatchChecker:
             rows = rows[is_valid]
         if pa.types.is_struct(array.type):
             prefix = where + _PREFIXES.get(name, "")
-            for part in array.type:
-                self.check(array.field(part.name), name=part.name, rows=rows, where=prefix)
+            for field in array.type:
+                self.check(array.field(field.name), name=field.name, rows=rows, where=prefix)
         elif pa.types.is_list(array.type):
-            lengths = np.diff(array.offsets.to_numpy())
+            lengths = np.diff(array.offsets.to_numpy())  # number of items of each list
+            # In a damaged file, the offsets may skip items. The rows of items would then be wrong.
             if lengths.sum() != len(array.values):
                 raise InputError(f"{where}{name} has items that belong to no sample.")
             if pa.types.is_struct(array.type.value_type):
@@ -105,11 +108,11 @@ class _BatchChecker:
             raise InputError(f"sample {token!r}: {problem}.")
 
 
-@np.errstate(invalid="ignore", over="ignore")
+@np.errstate(invalid="ignore", over="ignore")  # no warnings about sums of invalid entries
 def _are_pinholes(arrays: pa.FixedSizeListArray, *_: object) -> np.ndarray:
     """Test which intrinsics are valid pinhole matrices."""
     entries = np.ascontiguousarray(matrices_of(arrays, (9,)).T)  # (9, items), contiguous entries
-    are_finite = np.isfinite(entries.sum(0))
+    are_finite = np.isfinite(entries.sum(0))  # the sum is not finite if an entry is not
     have_focal_lengths = (entries[0] > 0) & (entries[4] > 0)  # fx and fy
     have_last_row = (entries[6] == 0) & (entries[7] == 0) & (entries[8] == 1)
     return are_finite & have_focal_lengths & have_last_row
@@ -124,11 +127,12 @@ def _are_transforms(arrays: pa.FixedSizeListArray, *_: object) -> np.ndarray:
 
 def _are_inside(paths: pa.StringArray, *_: object) -> np.ndarray:
     """Test which paths are relative, inside the data root and without control characters."""
+    # Arrow stores all texts of an array as one text, with the offsets of the single texts.
     _, offsets, data = paths.buffers()
     text = b"" if data is None else data.to_pybytes()
     bounds = np.frombuffer(offsets, dtype=np.int32, count=len(paths) + 1)
     # Fast path for nearly all files: a scan of the bytes instead of a regular expression.
-    letters = np.frombuffer(text, dtype=np.uint8)
+    letters = np.frombuffer(text, dtype=np.uint8)  # UTF-8; control characters are below the space
     are_plain = b".." not in text and b"\\" not in text and (letters >= ord(" ")).all()
     are_filled = (np.diff(bounds) > 0).all()
     # The first letter of path i is letters[bounds[i]].
@@ -145,7 +149,7 @@ def _are_names(names: pa.StringArray, *_: object) -> np.ndarray:
 
 def _are_camera_names(names: pa.StringArray, rows: np.ndarray, _: AnnotationMeta) -> np.ndarray:
     """Test which names of cameras are unique in their sample and safe as parts of a path."""
-    encoded = names.dictionary_encode()
+    encoded = names.dictionary_encode()  # replaces each name by its index among distinct names
     # One number for each pair of a sample and a name.
     keys = rows * len(encoded.dictionary) + encoded.indices.to_numpy()
     are_unique = np.bincount(keys)[keys] == 1
@@ -160,16 +164,19 @@ def _are_labels(labels: pa.Int32Array, _: np.ndarray, meta: AnnotationMeta) -> n
 
 def _are_polylines(lists: pa.ListArray, _: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
     """Test which polylines have two or more points, all finite and within the limit."""
+    # A polyline is stored as a flat list of the coordinates of its points.
     counts = np.diff(lists.offsets.to_numpy())  # coordinates of each polyline
     are_good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
     are_near = np.abs(lists.values.to_numpy(zero_copy_only=False)) <= MAX_LENGTH_M  # False for NaN
     if not are_near.all():
+        # Index of the polyline of each coordinate.
         line_numbers = np.repeat(np.arange(len(counts)), counts)
         are_good[line_numbers[~are_near]] = False
     return are_good
 
 
 _MAX_TRANSLATION_M = 1e8  # 2.5 times the circumference of the Earth
+# Entries of `_RULES` that several fields share: a test and a message.
 _TRANSFORM = (
     _are_transforms,
     " is no rigid transform: it must be finite, with a rotation, a translation within 100,000 km "
@@ -220,6 +227,7 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
 }
 """By the name of a field, the test of its items and the message about the first wrong item.
 
-Arguments of a test are the array, the index of the sample of each item, and the metadata. In a
-message, {0} is the item and {1} is the metadata.
+Arguments of a test are the array, the index of the sample of each item, and the metadata. The test
+returns a mask that is True for good items. The message follows the name of the field; in it, {0} is
+the item and {1} is the metadata.
 """

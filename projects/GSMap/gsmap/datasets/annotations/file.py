@@ -64,6 +64,7 @@ class AnnotationWriter:
         # Refuses to replace another program's file that has the name of a shard.
         shard.require_own(Path(path), mark=META_KEY)
         self.meta = meta
+        # Called once the file is complete. For the whole file it writes nothing.
         self._write_manifest = partial(
             shard.write_manifest,
             Path(path),
@@ -72,7 +73,7 @@ class AnnotationWriter:
             options=asdict(meta),
         )
         self._schema = schema_of(meta)
-        self._resources = ExitStack()
+        self._resources = ExitStack()  # the open file, from `__enter__` to `__exit__`
         self._rows: list[dict[str, Any]] = []
         self._tokens: set[str] = set()
         self._finished = False
@@ -100,7 +101,7 @@ class AnnotationWriter:
         if sample.token in self._tokens:
             raise InputError(f"sample {sample.token!r} was already written to {self.path}.")
         self._tokens.add(sample.token)
-        self._rows.append(row_of(sample, self.meta))
+        self._rows.append(row_of(sample, self.meta))  # also checks the shapes
         if len(self._rows) == _ROWS_PER_BATCH:
             self._flush()
 
@@ -240,7 +241,9 @@ class AnnotationFile(Sequence[MapSample]):
     def _open(self, sums: list[tuple[int, int]] | None = None) -> None:
         """Map and read the file, and check it.
 
-        With ``sums``, the checksums of another process, each batch is checked when it is read.
+        ``sums`` are the checksums of the process that pickled this instance. If they are given,
+        each batch is compared with its checksum when it is read. If not, the whole file is checked
+        now.
         """
         if not self.path.is_file():
             raise FileNotFoundError(
@@ -266,7 +269,7 @@ class AnnotationFile(Sequence[MapSample]):
         try:
             # End of each message in bytes, and checksum of all bytes before it.
             self._sums = sums or checksums(self._content, ends)
-            # Numbers of the batches that have been checked since the last change of the file.
+            # Indices of the batches that have been checked since the last change of the file.
             self._intact_batches = set() if sums else set(range(len(self._batches)))
             if sums is None:
                 self._check_content(seal)
@@ -289,7 +292,7 @@ class AnnotationFile(Sequence[MapSample]):
     def _check_content(self, seal: bytes | None) -> None:
         """Raise an error if the file does not match the seal, or a value is wrong."""
         if seal is not None:
-            expected = json.loads(seal)
+            expected = json.loads(seal)  # entries rows, bytes and crc32, from `AnnotationWriter`
             checksum_up_to = dict(self._sums)
             checksum = checksum_up_to.get(expected["bytes"])
             num_rows = sum(map(len, self._batches))
@@ -306,14 +309,14 @@ class AnnotationFile(Sequence[MapSample]):
     def _current_state(self) -> tuple[int, int, int]:
         """Return size and time of the file, and the process id.
 
-        Size and time change when the file is written. In a forked process, the process id differs,
-        so this process checks the file again.
+        Size and time of modification change when the file is written. In a forked process, the
+        process id differs, so this process compares each batch with its checksum again.
         """
         status = os.fstat(self._map.fileno())
         return status.st_size, status.st_mtime_ns, os.getpid()
 
     def _require_intact(self, number: int) -> None:
-        """Raise an error if a batch has changed since the file was opened.
+        """Raise an error if the batch with this index has changed since the file was opened.
 
         The size of the file is compared first: reading mapped memory beyond the end of a file ends
         the process.
@@ -341,7 +344,7 @@ class AnnotationFile(Sequence[MapSample]):
 
     @property
     def batches(self) -> list[pa.RecordBatch]:
-        """Samples as Arrow record batches."""
+        """Samples as Arrow record batches, which are compared with their checksums if necessary."""
         for number in range(len(self._batches)):
             self._require_intact(number)
         return self._batches
@@ -369,7 +372,7 @@ class AnnotationFile(Sequence[MapSample]):
         """
         for name, wanted in expected.items():
             value = getattr(self.meta, name)
-            if isinstance(wanted, list):
+            if isinstance(wanted, list):  # the metadata have tuples in place of a config's lists
                 wanted = tuple(wanted)
             if wanted is not None and wanted != value:
                 raise InputError(
@@ -392,10 +395,10 @@ class AnnotationFile(Sequence[MapSample]):
         names = np.array(self.column("scene"), dtype=str)
         _, scenes = np.unique(names, return_inverse=True)
         seconds = np.asarray(self.seconds_into_scene)
-        order = np.lexsort((seconds, scenes))  # by scene, then by time
+        order = np.lexsort((seconds, scenes))  # by the last key, the scene, and then by time
         is_within_scene = np.diff(scenes[order]) == 0
         steps = np.diff(seconds[order])[is_within_scene]  # between successive samples of a scene
-        if not len(steps):
+        if not len(steps):  # no scene has two samples
             return
         ratio = np.median(steps) * wanted_hz  # wanted rate divided by the rate of the file
         if 0.8 < ratio < 1.25:
@@ -414,10 +417,11 @@ class AnnotationFile(Sequence[MapSample]):
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)} in {self.path}.")
         index %= len(self)
-        number = int(np.searchsorted(self._starts, index, side="right")) - 1
-        self._require_intact(number)
-        decode = self._decoders[number]
-        return decode(index - int(self._starts[number]))
+        # The batch of a sample is the last one that does not start after it.
+        batch_index = int(np.searchsorted(self._starts, index, side="right")) - 1
+        self._require_intact(batch_index)
+        decode = self._decoders[batch_index]
+        return decode(index - int(self._starts[batch_index]))
 
     def column(self, name: str) -> list[Any]:
         """Return ``token``, ``scene``, ``map_name`` or ``timestamp_ns`` of all samples."""
@@ -441,7 +445,7 @@ class AnnotationFile(Sequence[MapSample]):
 
     def instance_counts(self) -> np.ndarray:
         """Return the number of map elements of each sample, -1 without ground truth. (samples,)"""
-        counts = [np.empty(0, dtype=np.int64)]
+        counts = [np.empty(0, dtype=np.int64)]  # the result for a file without batches
         for batch in self.batches:
             lengths = pc.list_value_length(batch.column("instances"))
             counts.append(lengths.fill_null(-1).to_numpy())
@@ -455,6 +459,7 @@ def _meta_of(schema: pa.Schema) -> AnnotationMeta:
     if not isinstance(values, dict):
         raise InputError("it holds Arrow's data, but it is not an annotation file")
     version = values.get("format_version")
+    # `equals` compares the names and types of the columns, but not the metadata.
     if version != FORMAT_VERSION or not schema.equals(pa.schema(FIELDS)):
         command = values.get("command") or "tools/create_data.py"
         raise InputError(
@@ -466,7 +471,7 @@ def _meta_of(schema: pa.Schema) -> AnnotationMeta:
 
 
 def _require_printable(values: dict[str, Any]) -> None:
-    """Raise an error for texts in the metadata that are not printable."""
+    """Raise an error for texts in the metadata that are not printable, as messages contain them."""
     texts = {name: values.get(name) for name in _TEXTS}
     classes = values.get("classes")
     if isinstance(classes, list):

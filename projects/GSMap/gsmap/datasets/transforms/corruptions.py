@@ -2,6 +2,8 @@
 
 The kinds of corruptions and their five severities follow MapBench and ImageNet-C. Random numbers
 depend only on the seed and the token of the sample, so they are equal for all severities of a kind.
+
+In keys such as ``lidar2cam``, ``lidar`` is the annotation frame, as in mmdet3d.
 """
 
 from collections.abc import Callable
@@ -51,6 +53,7 @@ def generator(seed: int, token: str) -> np.random.Generator:
         seed: Seed of the transform, at least 0.
         token: Token of the sample.
     """
+    # Python's `hash` of a text would differ between processes.
     return np.random.default_rng([seed, crc32(token.encode())])
 
 
@@ -62,14 +65,18 @@ def lose_cameras(results: dict[str, Any], views: NDArray[np.integer[Any]]) -> No
             changed in place.
         views: Indices of the views.
     """
-    finish_on_host(results)  # applies the recorded image steps now
+    # Image steps such as resizing may only be recorded, to run on the GPU later. They are applied
+    # here, before pixels change.
+    finish_on_host(results)
     for view in views.tolist():
         results["img"][view] = np.zeros_like(results["img"][view])
+        # With these extrinsics, the whole map is behind the camera.
         _set_extrinsics(results, view, lidar2cam=OUT_OF_SIGHT)
 
 
 def _set_extrinsics(results: dict[str, Any], view: int, lidar2cam: NDArray[np.float64]) -> None:
     """Set the extrinsics (4, 4) of a view, and update its projection from metres to pixels."""
+    # `img_aug_matrix` contains the resizing and cropping of the image. All matrices are (4, 4).
     lidar2img = results["img_aug_matrix"][view] @ results["cam2img"][view] @ lidar2cam
     results["lidar2cam"][view] = lidar2cam
     results["lidar2img"][view] = lidar2img
@@ -107,19 +114,21 @@ class CorruptImages(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Corrupt ``results['img']``, or ``lidar2cam`` and ``lidar2img``."""
-        finish_on_host(results)  # applies the recorded image steps now
+        finish_on_host(results)  # applies the recorded image steps, such as resizing, now
         rng = generator(self.seed, results["token"])
-        level = self.severity - 1
+        level = self.severity - 1  # index into the tuples with a value for each severity
         # Entries of the lists are replaced below, and the lists of the caller must not change.
         for key in ("img", "lidar2cam", "lidar2img"):
             results[key] = list(results[key])
         views = range(len(results["img"]))
         if self.kind == "camera_lost":
             num_lost = min(self.severity, len(views) - 1)
+            # A camera that is lost at one severity is also lost at all higher ones.
             lose_cameras(results, rng.permutation(len(views))[:num_lost])
         elif self.kind in _CALIBRATION_ERRORS:
             for view in views:
                 axis = rng.normal(size=3)
+                # Transform (4, 4) in the frame of the camera.
                 error = _CALIBRATION_ERRORS[self.kind](axis / np.linalg.norm(axis), level)
                 lidar2cam = error @ results["lidar2cam"][view]
                 _set_extrinsics(results, view, lidar2cam=lidar2cam)
@@ -163,6 +172,7 @@ def fog(results: dict[str, Any], view: int, visibility_m: float) -> NDArray[Any]
     rays = ego_from_cam[:3, :3] @ np.linalg.solve(intrinsics, pixels.reshape(3, -1))  # (3, H * W)
     slopes = rays[2] / np.linalg.norm(rays, axis=0)  # rise per metre of distance
     slopes = np.minimum(slopes, -1e-6)  # rays above the horizon would never reach the ground
+    # The ground is taken to be at z = 0 in the frame of the vehicle.
     camera_height_m = np.maximum(ego_from_cam[2, 3], 0.1)
     distance_m = np.minimum(camera_height_m / -slopes, _MAX_FOG_DISTANCE_M)
     contrast = np.exp(np.log(0.05) / visibility_m * distance_m).reshape(height, width, 1)
@@ -178,17 +188,18 @@ def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
         rng: Generator for the places of the streaks.
     """
     height, width = image.shape[:2]
-    is_centre = rng.random((height, width)) < _RAIN_DENSITIES[level]  # of a streak
+    # Whether a pixel is the centre of a streak.
+    is_centre = rng.random((height, width)) < _RAIN_DENSITIES[level]
     centres = is_centre.astype(np.float32)
-    length = max(3, round(0.06 * height))
-    streak = np.zeros((length, length), dtype=np.float32)
+    length = max(3, round(0.06 * height))  # of a streak, in pixels
+    streak = np.zeros((length, length), dtype=np.float32)  # image of one streak
     top = (length * 2 // 5, 0)  # (column, row)
     bottom = (length * 3 // 5, length - 1)  # the streak is nearly vertical
     cv2.line(streak, top, bottom, color=(1.0,))
     # The filter draws a streak around each centre.
     streaks = cv2.filter2D(centres, ddepth=-1, kernel=streak)
     opacity = np.clip(streaks, 0, 1)[..., None] * _STREAK_OPACITY
-    greyness = 0.04 * (level + 1)
+    greyness = 0.04 * (level + 1)  # share of a medium grey in all pixels, which lowers the contrast
     grey_image = image * (1 - greyness) + 128 * greyness
     return _grey_levels(grey_image * (1 - opacity) + _STREAK_GREY * opacity)
 
@@ -275,12 +286,15 @@ class DelayCameras(BaseTransform):
 
     @cached_property
     def _previous_rows(self) -> dict[str, int]:
-        """Row of the previous sample of the scene, by the token of a sample."""
+        """Row in the annotation file of the scene's previous sample, by the token of a sample.
+
+        First samples of scenes have no entry.
+        """
         scenes = self._file.column("scene")
         times_ns = self._file.column("timestamp_ns")
         tokens = self._file.column("token")
         rows = range(len(tokens))
-        samples = sorted(zip(scenes, times_ns, tokens, rows, strict=True))
+        samples = sorted(zip(scenes, times_ns, tokens, rows, strict=True))  # by scene, then by time
         previous_rows = {}
         for previous, current in pairwise(samples):
             previous_scene, _, _, previous_row = previous
@@ -301,6 +315,7 @@ class DelayCameras(BaseTransform):
             return results
         images = dict(results["images"])
         names = list(images)
+        # Paths of the images of the previous sample.
         paths = {camera.name: camera.path for camera in self._file[row].cameras}
         rng = generator(self.seed, results["token"])
         num_late = min(self.severity, len(names) - 1)
@@ -330,6 +345,7 @@ class DropCameras(BaseTransform):
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Black out random views of ``results['img']``."""
         if np.random.random() < self.prob:  # noqa: NPY002 - seeded by mmengine
+            # `lose_cameras` replaces entries, and the lists of the caller must not change.
             for key in ("img", "lidar2cam", "lidar2img"):
                 results[key] = list(results[key])
             views = np.random.permutation(len(results["img"]))  # noqa: NPY002

@@ -23,7 +23,7 @@ from gsmap.structures.polylines import (
 )
 from gsmap.utils.errors import InputError
 
-ORDERS = ("vertices", "points")
+ORDERS = ("vertices", "points")  # values of `orders_of`, explained in `map_targets`
 
 
 def map_targets(
@@ -69,6 +69,7 @@ def map_targets(
         num_orders = max(num_points - 1, 2)  # an open line has two orders
     points = np.empty((len(instances), num_points, dim))
     orders = np.empty((len(instances), num_orders, num_points, dim))
+    # Number M of vertices of the longest element; any number serves if there is no element.
     longest = max((len(instance.points) for instance in instances), default=2)
     polylines = np.empty((len(instances), longest, 2))
     closed = np.empty(len(instances), dtype=bool)
@@ -81,6 +82,7 @@ def map_targets(
         line = instance.points[:, :dim].astype(np.float64)
         points[i] = resample(line, num_points)
         if orders_of == "vertices":
+            # These orders are resampled from the line at full resolution.
             orders[i] = equivalent_orders(line, num_points, rng=rng)
         else:
             is_ring = ends_meet(points[i], x_range=x_range, y_range=y_range)
@@ -88,7 +90,7 @@ def map_targets(
         polylines[i, : len(line)] = line[:, :2]
         polylines[i, len(line) :] = line[-1, :2]  # repeat the last vertex
         closed[i] = is_closed(instance.points[:, :dim])
-    is_unused = orders == PADDING
+    is_unused = orders == PADDING  # both functions fill unused orders with this value, -10000
     points = clamp(points, x_range=x_range, y_range=y_range)
     orders = clamp(orders, x_range=x_range, y_range=y_range)
     orders[is_unused] = PADDING  # `clamp` has moved the padding to the edge
@@ -122,6 +124,7 @@ def ends_meet(
         x_range: Smallest and largest x of the map in metres.
         y_range: Smallest and largest y of the map in metres.
     """
+    # In multiples of the extent, so that one tolerance serves for both axes.
     origin = np.array([x_range[0], y_range[0]])
     extent = np.array([x_range[1] - x_range[0], y_range[1] - y_range[0]])
     first_norm = (points[0, :2] - origin) / extent
@@ -151,6 +154,7 @@ class FormatMapTargets(BaseTransform):
         Raises:
             ValueError: If the sample has no ground truth, or has no heights and ``dim`` is 3.
         """
+        # List of `MapInstance`. Without ground truth, an error names this transform.
         elements = ground_truth_elements(results, transform=self)
         # The seed comes from the global generator, which mmengine seeds in each worker.
         seed = np.random.randint(2**31)  # noqa: NPY002
@@ -160,7 +164,7 @@ class FormatMapTargets(BaseTransform):
             num_points=self.num_points,
             x_range=results["x_range"],
             y_range=results["y_range"],
-            dim=results.get("dim", 2),
+            dim=results.get("dim", 2),  # set by the data set
             rng=rng,
             orders_of=self.orders_of,
         )

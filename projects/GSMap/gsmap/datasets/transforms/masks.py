@@ -21,7 +21,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
 _NUM_PV_POINTS = 200  # resampled points of an element for its projection into the cameras
-_EPSILON = 1e-7  # added to depths before a division
+_EPSILON = 1e-7  # metres, added to depths before a division
 
 
 def bev_cells(instance: MapInstance, results: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
@@ -77,6 +77,7 @@ class MakeBEVMask(BaseTransform):
                 ``num_classes``.
         """
         masks = np.zeros((self.num_classes or 1, *self.size), dtype=np.uint8)
+        # A list of `MapInstance`. Without ground truth, an error names this transform.
         for instance in ground_truth_elements(results, self):
             cells = bev_cells(instance, results, size=self.size)
             channel = channel_of(instance, self.num_classes)
@@ -127,7 +128,8 @@ class MakeInstanceMasks(BaseTransform):
                 f"sample {results['token']!r} has no targets yet: put MakeInstanceMasks behind "
                 "FormatMapTargets in the pipeline."
             )
-        masks = np.zeros((len(instances), *self.size), dtype=np.uint8)
+        masks = np.zeros((len(instances), *self.size), dtype=np.uint8)  # cv2 draws no booleans
+        # Wider lines, in which cells of elements with a lower label are removed.
         gaps = np.zeros_like(masks)
         for index, instance in enumerate(instances):
             cells = bev_cells(instance, results, size=self.size)
@@ -191,6 +193,7 @@ class MakePVMask(BaseTransform):
     def _elements(self, results: dict[str, Any]) -> Iterator[tuple[MapInstance, np.ndarray]]:
         """Yield each element with its points in metres, (n, 2) or (n, 3)."""
         elements = ground_truth_elements(results, self)
+        # Heights in metres of the vertices of each element; None if the file has none.
         heights = results.get("map_heights") if self.heights else None
         lacks_heights = any(element.points.shape[1] == 2 for element in elements)
         if self.heights and heights is None and lacks_heights:
@@ -208,13 +211,15 @@ class MakePVMask(BaseTransform):
             ValueError: If the sample has no ground truth, or a label is not less than
                 ``num_classes``.
         """
+        # Rows and columns of the images, rounded up to multiples of the divisor.
         height, width = padded_size(results["img_shape"], self.pad_size_divisor)
+        # Projection of each view from the annotation frame (``lidar``) in metres to pixels. (4, 4)
         matrices = results["lidar2img"]
         num_channels = self.num_classes or 1
         rows = height // self.stride
         cols = width // self.stride
         masks = np.zeros((len(matrices), num_channels, rows, cols), dtype=np.uint8)
-        lines = []
+        lines = []  # channel and homogeneous points (200, 4) of each element
         for instance, points in self._elements(results):
             channel = channel_of(instance, self.num_classes)
             lines.append((channel, self._homogeneous_points(points)))
@@ -223,6 +228,7 @@ class MakePVMask(BaseTransform):
             feature_from_frame = feature_from_img @ lidar2img
             for channel, line in lines:
                 projected = line @ feature_from_frame.T  # (200, 4)
+                # `u` and `v` are feature pixels times depth. Points behind the camera are dropped.
                 u, v, depth = projected[:, :3].T
                 is_ahead = depth > 0
                 pixels = np.stack([u[is_ahead], v[is_ahead]], axis=-1)
@@ -262,6 +268,7 @@ def channel_of(instance: MapInstance, num_classes: int | None) -> int:
 @cache
 def _log_flat_ground(ground_z_m: float) -> None:
     """Log once that masks of the camera views are drawn on flat ground for lack of heights."""
+    # `cache` limits the message to one per process, and each worker of a data loader is a process.
     worker = get_worker_info()
     if worker is None or worker.id == 0:
         print_log(

@@ -15,11 +15,14 @@ from gsmap.utils.json_items import items_of
 KINDS = ("removed", "added", "moved")
 """Kinds of changes."""
 STEP_M = 0.5
-"""Distance of the points at which changes are compared."""
+"""Distance in metres of the points at which changes are compared."""
+# Limits of the values of a file, which may be untrusted.
 _FARTHEST_M = 1e7  # largest coordinate
 _LONGEST_M = 1e6  # largest sum of the lengths of all changes of a file
 _LONGEST_NAME = 80  # letters
-_ABSENT = "absent"  # value of a key that the file does not contain
+# Value of a key that the file does not contain. It cannot be None, which is the value of a present
+# key with ``null``.
+_ABSENT = "absent"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +75,12 @@ def read_changes(path: str | Path) -> list[MapChange]:
         ValueError: If the file is malformed, or a value is out of range.
     """
     path = Path(path)
-    members: dict[str, Any] = {"crs": _ABSENT}  # `items_of` fills in the value of the file
+    members: dict[str, Any] = {"crs": _ABSENT}  # `items_of` replaces the value by the file's value
     advice = "give a GeoJSON file of changes (build_map.py --changes, or MiniCity's)"
     changes = []
     total_m = 0.0
+    # Each item comes with its place in the file, which is not used here. The file is read step by
+    # step, so the value of "crs" is only known after the loop.
     for number, (feature, _) in enumerate(
         items_of(path, "features", advice, other_entries=members)
     ):
@@ -87,7 +92,7 @@ def read_changes(path: str | Path) -> list[MapChange]:
             if total_m > _LONGEST_M:
                 raise InputError(f"the changes are longer than {_LONGEST_M / 1000:g} km")
         except InputError as error:
-            text = str(error).rstrip(".")
+            text = str(error).rstrip(".")  # some messages end with a full stop
             raise InputError(f"{path}, feature {number}: {text}.") from error
         changes.append(change)
     if members["crs"] is not None:
@@ -99,7 +104,7 @@ def read_changes(path: str | Path) -> list[MapChange]:
 
 
 def _read_feature(feature: Any) -> MapChange:
-    """Read a feature of a file of changes."""
+    """Read a feature of a file of changes. Errors quote at most 60 letters of a wrong value."""
     if not isinstance(feature, dict) or not isinstance(feature.get("properties"), dict):
         raise InputError("it is no object with properties")
     properties = feature["properties"]

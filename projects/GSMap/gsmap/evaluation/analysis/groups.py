@@ -21,6 +21,7 @@ from gsmap.utils.files import read_json
 CONDITIONS = ("clear", "cloudy", "dusk", "night", "rain")
 """Words for weather and light in the descriptions of scenes, in nuScenes and MiniCity."""
 OTHERWISE = "day"  # group of a scene without such a word; nuScenes has no word for a dry day
+# Column of the annotation file that contains the group, by the value of ``by`` in `read_groups`.
 _COLUMNS = {"scene": "scene", "map": "map_name"}
 _LONGEST = 80  # characters of the name of a group
 
@@ -88,11 +89,13 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
         )
     file = AnnotationFile(annotations)
     if Path(by).suffix.lower() == CHANGES_SUFFIX:
+        # The groups are "changed" and "unchanged".
         return Groups(changed_samples(read_changes(by), file))
     tokens = file.column("token")
     if by in _COLUMNS:
         groups = file.column(_COLUMNS[by])
         return Groups(dict(zip(tokens, groups, strict=True)))
+    # The keys of the file are names of scenes if none of them is the token of a sample.
     group_of = _read_group_file(by)
     if group_of.keys().isdisjoint(tokens):
         kind = "scene"
@@ -130,7 +133,7 @@ def _is_group_name(value: object) -> bool:
 
 
 def _conditions(description: object) -> str:
-    """Return the words for weather and light in a description."""
+    """Return the words for weather and light in a description, joined by commas."""
     words = set(re.findall("[a-z]+", str(description).lower()))
     return ", ".join(word for word in CONDITIONS if word in words) or OTHERWISE
 
@@ -153,8 +156,9 @@ def ap_by_group(reports: Sequence[MetricReport], groups: Groups) -> dict[str, di
     for name in groups.names:
         group_aps[name] = {}
     for report in reports:
-        for key, values in resampled_figures(report, groups).items():
-            for name, value in zip(groups.names, values, strict=True):
+        # Each key has one AP per group, in the order of `groups.names`.
+        for key, aps in resampled_figures(report, groups).items():
+            for name, value in zip(groups.names, aps, strict=True):
                 group_aps[name][key] = UNDEFINED if np.isnan(value) else float(value)
     return group_aps
 
@@ -169,6 +173,7 @@ def group_report(group_aps: Mapping[str, Mapping[str, float]]) -> MetricReport:
     for name, aps in group_aps.items():
         for key, value in aps.items():
             metrics[f"by/{name}/{key}"] = value
+    # The report has figures only: no groups of classes and no ranked predictions.
     return MetricReport(name="by", groups={}, metrics=metrics, detections={})
 
 
@@ -189,7 +194,7 @@ def group_table(
     head = ["", "samples"]
     keys = []
     for report in reports:
-        if report.detections:
+        if report.detections:  # a metric that ranks no predictions has no AP
             head.append(f"{report.name} mAP")
             keys.append(f"{report.name}/mAP")
             for class_name in report.detections:
@@ -198,8 +203,9 @@ def group_table(
     group_index, _ = groups.draw_copies(reports[0].tokens)
     num_samples = np.bincount(group_index, minlength=len(groups.names))
     rows = []
-    for (name, figures), number in zip(group_aps.items(), num_samples, strict=True):
-        row = [name, str(number)]
+    # Both are in the order of `groups.names`.
+    for (name, figures), count in zip(group_aps.items(), num_samples, strict=True):
+        row = [name, str(count)]
         for key in keys:
             value = figures[key]
             row.append("-" if value == UNDEFINED else f"{100 * value:.1f}")

@@ -20,7 +20,8 @@ def precision_recall(hits: BoolArray, num_gts: int) -> tuple[FloatArray, FloatAr
         num_gts: Number of ground truths.
 
     Returns:
-        Two arrays: recall and precision in [0, 1]. (N,) each
+        Two arrays, recall first (unlike in the name of the function): recall and precision in
+        [0, 1]. (N,) each
     """
     true_positives = np.cumsum(hits, dtype=np.float64)
     recall = true_positives / max(num_gts, 1)
@@ -79,7 +80,7 @@ def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
     not reach the recall 0.7. Here they do.
 
     Args:
-        hits: Whether each prediction matches, in the order in which predictions count. (N,)
+        hits: Whether each prediction matches, in the order in which the metric ranks them. (N,)
         num_gts: Number of ground truths, > 0.
 
     Returns:
@@ -88,7 +89,8 @@ def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
     _, precision = precision_recall(hits, num_gts)
     # Matches that reach each recall: recall * num_gts, rounded up.
     min_true_positives = -(-np.arange(1, 11) * num_gts // 10)
-    # As in `interpolated_ap`: the precision is 0 at recalls that no prediction reaches.
+    # Index of the first prediction with as many matches. As in `interpolated_ap`, the precision is
+    # 0 at recalls that no prediction reaches.
     ranks = np.searchsorted(np.cumsum(hits), min_true_positives, side="left")
     return float(np.append(_envelope(precision), 0.0)[ranks].mean())
 
@@ -104,7 +106,7 @@ def reliability(scores: FloatArray, hits: BoolArray) -> tuple[FloatArray, FloatA
         Three arrays: mean score, share of matches, and number of predictions of each bin that is
         not empty. (<= 10,) each
     """
-    bins = np.clip((scores * 10).astype(np.int64), 0, 9)
+    bins = np.clip((scores * 10).astype(np.int64), 0, 9)  # a score of 1 is in the last bin
     # Give consecutive numbers to the bins that are not empty.
     _, bins, counts = np.unique(bins, return_inverse=True, return_counts=True)
     score_sums = np.bincount(bins, weights=scores)

@@ -19,6 +19,7 @@ _NO_NAN = {"nnan", "nsz"}
 _BOUND_SLACK = 1.0 - 1e-12  # factor that makes a bound safe against rounding errors
 
 
+# With numpy's error model, divisions are not checked for a divisor of 0.
 @njit(cache=True, error_model="numpy")
 def resample_lines(points: FloatArray, offsets: IntArray, num_points: int) -> FloatArray:
     """Resample lines at equal arc length in the plane.
@@ -88,6 +89,7 @@ def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
             dy = ay[i] - by[j]
             dz = az[i] - bz[j]
             squared[j] = dx * dx + dy * dy + dz * dz
+        # The minima are computed in a separate loop, so that both loops vectorise.
         nearest = np.inf
         for j in range(len(bx)):
             nearest_to_second[j] = min(nearest_to_second[j], squared[j])
@@ -130,6 +132,7 @@ def _boxes(points: FloatArray, offsets: IntArray) -> FloatArray:
 def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) -> bool:
     """Check whether at least one point projects onto a segment of a line and is close to it.
 
+    A point that projects onto an end of a segment does not count for this segment.
     A point whose distance is ``half_width_m`` up to rounding errors does not count as close.
 
     Args:
@@ -185,8 +188,9 @@ def pair_distances(pred: Lines, gt: Lines, max_distance: float) -> FloatArray:
     distances = np.full((len(pred_labels), len(gt_labels) + 1), np.inf)
     for i in range(len(pred_labels)):
         box = pred_boxes[i]
-        if box[0] == box[2] and box[1] == box[3]:
+        if box[0] == box[2] and box[1] == box[3]:  # a line without length
             continue
+        # Rows of a slice are not adjacent in memory. The copy makes them adjacent for the loops.
         pred_line = np.ascontiguousarray(pred_points[:, pred_offsets[i] : pred_offsets[i + 1]])
         for k in range(len(gt_labels)):
             if pred_labels[i] != gt_labels[k] or not has_length[k]:

@@ -47,7 +47,7 @@ _GROUP_FIGURES = ("AP", "AR", "recall", "mIoU")  # prefixes of the figures with 
 @register_metric
 @dataclass(frozen=True)
 class RasterConfig(Metric):
-    """Metric AP_raster and its rules.
+    """Metric AP_raster (``--eval raster``) and its rules.
 
     Args:
         classes: Names of the classes; a label is an index into them.
@@ -62,7 +62,7 @@ class RasterConfig(Metric):
 
     name: ClassVar[str] = "raster"
     ranks: ClassVar[bool] = True  # predictions are ranked over all samples
-    has_curves: ClassVar[bool] = True
+    has_curves: ClassVar[bool] = True  # precision-recall curves describe the metric
 
     classes: tuple[str, ...]
     grid: BEVGrid = NUSCENES_GRID
@@ -71,9 +71,11 @@ class RasterConfig(Metric):
     dilation_px: int = 5
 
     def __post_init__(self) -> None:
+        # The dataclass is frozen, which forbids a plain assignment.
         object.__setattr__(self, "classes", checked_classes(self.classes))
         if not 0 < self.px_per_m < math.inf or min(self.size_px) < 1:  # `not` is true for NaN, too
             raise InputError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
+        # Integers could overflow in the product.
         if np.prod(self.size_px, dtype=np.float64) > _MOST_PX:
             columns, rows = self.size_px
             raise InputError(
@@ -172,11 +174,15 @@ def match_raster(
         config: Rules of the metric.
         token: Name of the sample.
 
+    Returns:
+        Matches of the predictions that count, at the thresholds of the class of each prediction.
+
     Raises:
-        ValueError: As for `check_pair`.
+        ValueError: If a label is below -1 or beyond the classes, or predictions have no scores.
     """
     check_pair(predictions, ground_truth, classes=config.classes, token=token)
     num_classes = len(config.classes)
+    # Indices of the predictions that count, in descending order of score, as `assign` requires.
     rows = ranked_predictions(
         predictions, num_classes=num_classes, min_score=MIN_SCORE, max_num=MAX_PREDICTIONS
     )
@@ -189,8 +195,9 @@ def match_raster(
         pred_masks, gts=gt_masks, pred_labels=pred_labels, gt_labels=gt_labels
     )  # (N, K)
     class_thresholds = np.array(list(config.thresholds.values()))
-    matched = assign(ious, thresholds=class_thresholds[pred_labels])  # (N, T)
-    # Without a match, ``matched`` is -1, the index of the last entry.
+    # At each threshold, each prediction takes the best ground truth that is still free. (N, T)
+    matched = assign(ious, thresholds=class_thresholds[pred_labels])
+    # Without a match, ``matched`` is -1. As an index, it selects the last entry, appended here.
     padded_gt_index = np.append(gt_index, -1)
     padded_ious = np.full((len(rows), len(gt_index) + 1), fill_value=np.nan)
     padded_ious[:, :-1] = ious
@@ -214,8 +221,15 @@ def _mean(values: Iterable[float]) -> float:
 
 
 def _class_figures(ranked: ClassDetections, ious: FloatArray) -> dict[str, float]:
-    """Compute the figures of one class from its predictions and its IoU in each sample (S,)."""
+    """Compute the figures of one class, by name.
+
+    Args:
+        ranked: Predictions of the class in all samples, by descending score. Their ``hits`` (N, T)
+            are True where a prediction matches at a threshold.
+        ious: IoU of the class in each sample, NaN in samples without the class. (S,)
+    """
     aps = [interpolated_ap(hits, num_gts=ranked.num_gts) for hits in ranked.hits.T]
+    # AP, recall and counts. Without ground truth, the recall is UNDEFINED (-1).
     figures = class_figures(ranked, aps=aps, absent=UNDEFINED)
     for limit in RECALL_LIMITS:
         figures[f"AR@{limit}"] = UNDEFINED
@@ -236,7 +250,7 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
         matches: Matches of all samples by the rules of ``config``.
         config: Rules of the metric.
     """
-    detections = matches.detections(config.thresholds)
+    detections = matches.detections(config.thresholds)  # `ClassDetections` by name of the class
     figures: dict[str, dict[str, float]] = {}
     metrics: dict[str, float] = {}
     num_present = 0
@@ -253,7 +267,7 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
         groups.setdefault(group, []).append(name)
     for group, names in groups.items():
         for key in figures[names[0]]:
-            if key.startswith(_GROUP_FIGURES):
+            if key.startswith(_GROUP_FIGURES):  # one of these prefixes
                 metrics[f"{group}/{key}"] = _mean(figures[name][key] for name in names)
     metrics["mAP"] = _mean(values["AP"] for values in figures.values())
     metrics["mIoU"] = _mean(values["mIoU"] for values in figures.values())
@@ -265,5 +279,5 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
         metrics={f"raster/{key}": value for key, value in metrics.items()},
         detections=detections,
         tokens=matches.tokens,
-        by_distance=False,
+        by_distance=False,  # thresholds are IoUs, not distances
     )

@@ -26,7 +26,8 @@ def _stamp(mask: WordArray, width: int, row: int, left: int, right: int, radius:
     """Set the pixels ``left`` to ``right`` of a row, dilated by a square and cut to the mask."""
     low = max(left - radius, 0)
     high = min(right + radius, width - 1)
-    first = low >> 6  # word of the column `low`
+    # A word has 64 columns: column >> 6 is the word of a column, and column & 63 is its bit.
+    first = low >> 6
     last = high >> 6
     head = _ALL_BITS << np.uint64(low & 63)  # bits of the first word from column `low` on
     tail = _ALL_BITS >> np.uint64(63 - (high & 63))  # bits of the last word up to column `high`
@@ -68,6 +69,7 @@ def _clip_segment(a: IntArray, b: IntArray, height: int, width: int) -> bool:
         beyond_b = _side(b[axis], limit=limit)
         if beyond_a * beyond_b > 0:  # both ends are beyond one border
             return False
+        # Along the other axis, too, both ends may be beyond one border.
         if _side(a[other], limit=other_limit) * _side(b[other], limit=other_limit) > 0:
             return False
         for end, beyond in ((a, beyond_a), (b, beyond_b)):
@@ -96,6 +98,8 @@ def _draw_segment(mask: WordArray, width: int, start: IntArray, end: IntArray, r
     is_steep = dy > dx
     major = max(dx, dy)
     minor = min(dx, dy)
+    # Below 0 if the pixel after a step along the longer axis alone would lie more than half a pixel
+    # beside the segment.
     error = major - 2 * minor
     left = x  # first pixel of the current row
     for _ in range(major):
@@ -136,7 +140,9 @@ def _fill(
     num_edges = len(corners)
     height = mask.shape[0]
     x_start = np.zeros(num_edges, dtype=np.int64)
-    slope = np.zeros(num_edges, dtype=np.int64)
+    slope = np.zeros(num_edges, dtype=np.int64)  # columns per row, in units of 1 / 65536 pixel
+    # First row of each edge, and the row after its last one. Horizontal edges keep 0 and 0, so they
+    # cross no row.
     low = np.zeros(num_edges, dtype=np.int64)
     high = np.zeros(num_edges, dtype=np.int64)
     for i in range(num_edges):
@@ -162,6 +168,7 @@ def _fill(
                 crossings[count] = x_start[i] + (row - low[i]) * slope[i]
                 count += 1
         crossings[:count].sort()
+        # Even-odd rule: the inside lies between crossings 0 and 1, 2 and 3, and so on.
         for i in range(0, count - 1, 2):
             left = max(0, crossings[i] // _PER_PIXEL)
             right = min(width - 1, crossings[i + 1] // _PER_PIXEL)
@@ -218,6 +225,7 @@ def draw(
 @njit(cache=True)
 def _count(word: int) -> int:
     """Count the bits of a word; compilers replace this pattern by one instruction."""
+    # Sums in groups of 2, 4 and 8 bits. The product adds the eight bytes in its highest byte.
     pairs = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     fours = (pairs & np.uint64(0x3333333333333333)) + (
         (pairs >> np.uint64(2)) & np.uint64(0x3333333333333333)
@@ -253,12 +261,14 @@ def mask_ious(
         IoU in [0, 1]; 0 for pairs of different classes. (N, K)
     """
     ious = np.zeros((len(preds), len(gts)))
+    # A mask shares all of its pixels with itself, so these are areas in pixels.
     gt_areas = [_count_shared(gts[k], gts[k]) for k in range(len(gts))]
     for i in range(len(preds)):
         area = _count_shared(preds[i], preds[i])
         for k in range(len(gts)):
             if pred_labels[i] == gt_labels[k]:
                 shared = _count_shared(preds[i], gts[k])
+                # The limit avoids a division by 0 if both masks are empty (outside of the canvas).
                 ious[i, k] = shared / max(area + gt_areas[k] - shared, 1)
     return ious
 
@@ -308,5 +318,5 @@ def class_ious(
             shared = _count_shared(pred_union, gt_union)
             pred_area = _count_shared(pred_union, pred_union)
             gt_area = _count_shared(gt_union, gt_union)
-            ious[label] = shared / max(pred_area + gt_area - shared, 1)
+            ious[label] = shared / max(pred_area + gt_area - shared, 1)  # 0 if both are empty
     return ious

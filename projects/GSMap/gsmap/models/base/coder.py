@@ -101,7 +101,8 @@ class MapCoder:
         """
         keep = torch.ones_like(scores, dtype=torch.bool)
         if self.margin_m is not None:
-            low, high = constant(pts, [self.grid.x_range, self.grid.y_range]).T  # (x, y) each
+            # Corners (x, y) of the map. `constant` uploads and caches them.
+            low, high = constant(pts, [self.grid.x_range, self.grid.y_range]).T
             keep = (pts[..., :2].amin(1) >= low - self.margin_m).all(-1)
             keep &= (pts[..., :2].amax(1) <= high + self.margin_m).all(-1)
         if self.score_threshold is not None:
@@ -153,10 +154,11 @@ class MapCoder:
         points = fields["pts"]
         is_line = torch.isin(labels, constant(labels, self.unfold_classes))
         orders = torch.arange(points.shape[1], device=points.device).repeat(len(points), 1)
+        # New order of the points of each line, computed in numpy. (lines, P)
         line_orders = shortest_orders(points[is_line].cpu().numpy())
         orders[is_line] = torch.from_numpy(line_orders).to(orders)
-        # (M, 1) and (M, P): the new point j of detection i is its previous point ``orders[i, j]``.
-        rows = torch.arange(len(points), device=points.device)[:, None]
+        # The new point j of detection i is its previous point ``orders[i, j]``.
+        rows = torch.arange(len(points), device=points.device)[:, None]  # (M, 1)
         return {name: values[rows, orders] for name, values in fields.items()}
 
 
@@ -164,7 +166,7 @@ class DetectionHead(BaseModule, NeedsTargets):
     """Base class of map heads, which predict the detections of the last decoder layer.
 
     Attributes:
-        reference: Decoding of references to points.
+        reference: Decoding of references, the geometry that the queries predict, to points.
         coder: Selection of detections.
         not_exported: Reason why the head has no ONNX export; empty if it has one.
     """
@@ -202,7 +204,7 @@ class DetectionHead(BaseModule, NeedsTargets):
         """
         last = outputs[-1]
         results = []
-        for scores, references in zip(last.scores, last.references, strict=True):
+        for scores, references in zip(last.scores, last.references, strict=True):  # samples
             fields = self.reference.decode(references)
             scores = self.coder.weigh_scores(scores, fields)
             best = self.coder.decode(scores, fields["pts"])
@@ -210,7 +212,7 @@ class DetectionHead(BaseModule, NeedsTargets):
             detections = self.coder.unfold_lines(best_fields, best.labels)
             detections["scores_3d"] = best.scores
             detections["labels_3d"] = best.labels
-            metainfo = dict(self.reference.metainfo)
+            metainfo = dict(self.reference.metainfo)  # `InstanceData` accepts no other mapping
             results.append(InstanceData(metainfo=metainfo, **detections))
         return results
 

@@ -13,11 +13,12 @@ class QueryGroup:
 
     Args:
         num: Number of instance queries, >= 1.
-        name: Suffix of the names of its losses. It is empty for the group whose queries give the
-            predictions of the model.
+        name: Suffix of the group in the names of its losses. It is empty for the group whose
+            queries give the predictions of the model.
         repeats: Number of queries that each ground truth is matched to, >= 1.
-        weight: Weight of its losses.
-        losses: Names of its losses. None means all losses of the head.
+        weight: Factor of the losses of the group.
+        losses: Names of the losses of the head that are computed for the group. None means all of
+            them.
 
     Raises:
         ValueError: If ``num`` or ``repeats`` is not positive.

@@ -14,12 +14,12 @@ from gsmap.models.base.pairs import BuiltHead, GroundTruth, MatchedPairs, Predic
 
 
 class FlowStart(NamedTuple):
-    """Input of the first decoder layer.
+    """Input of the first decoder layer: N instances with P points each.
 
     Attributes:
         queries: States, positions and references (reference points) for `MapDecoder.forward`.
             States and positions are (B, N * P, C) for a decoder of point queries, and (B, N, C) for
-            a decoder of instance queries. References are (B, N * P, D).
+            a decoder of instance queries. References are (B, N * P, D), with D numbers per point.
         mask: True where an instance (row) may not attend to another instance (column); None if
             nothing is masked. (N, N)
     """
@@ -29,7 +29,15 @@ class FlowStart(NamedTuple):
 
 
 class FlowHead(BuiltHead, Protocol):
-    """Interface of a head to its hooks."""
+    """Interface of a head to its hooks.
+
+    Attributes:
+        embed_dims: Channels C of the queries.
+        num_points: Points P of an instance.
+        query_groups: Groups of instance queries, which are matched separately. The first group
+            gives the predictions of the model.
+        cls_branches: Classification branch of each decoder layer.
+    """
 
     embed_dims: int
     num_points: int
@@ -78,7 +86,8 @@ class FlowHook:
         Args:
             head: The head.
             layer: Index of the layer.
-            refined: References refined by the head. (B, N * P, D)
+            refined: References after this layer, as the head and the previous hooks have refined
+                them. (B, N * P, D)
         """
         return refined
 
@@ -104,9 +113,11 @@ class FlowHook:
     def targets(self, head: FlowHead, pairs: MatchedPairs) -> None:
         """Receive the matches of the first query group in the last layer.
 
+        The method is called before `losses`.
+
         Args:
             head: The head.
-            pairs: The pairs of the last layer.
+            pairs: Matched pairs of predictions and ground truths.
         """
 
     def losses(self, head: FlowHead, truths: GroundTruth) -> dict[str, Tensor]:
@@ -122,8 +133,8 @@ class FlowHook:
 class FlowPart(Protocol):
     """Interface of modules of a head that make a `FlowHook` for each training batch.
 
-    The module is built with its settings and with ``embed_dims`` and ``num_classes``. It is not
-    used in prediction.
+    The head builds the module from its settings, and adds ``embed_dims`` and ``num_classes`` to
+    them. The module is not used in prediction.
 
     Attributes:
         name: Name of the module, unique in a head.

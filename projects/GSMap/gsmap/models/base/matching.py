@@ -18,7 +18,7 @@ from gsmap.utils.errors import InputError, NotFiniteError
 
 
 class HostCosts(NamedTuple):
-    """Inputs of the assignment on the CPU.
+    """Inputs of the assignment on the CPU, for L decoder layers with N queries each.
 
     Attributes:
         samples: Values of the n costs for each sample. Rows are the predictions of all layers,
@@ -51,7 +51,7 @@ class MapAssigner:
             if isinstance(cost, PointsCost):
                 points_cost = cost
                 break
-        self.between_points = points_cost.between_points
+        self.between_points = points_cost.between_points  # distance that selects the point order
 
     @torch.no_grad()
     def assign(
@@ -147,6 +147,7 @@ class MapAssigner:
             indices.append(torch.stack([sample, query, query + first_query, gt, row]))
             counts.append(query.shape[1])
         host_indices = torch.cat(indices, dim=2)  # (5, L, M), M pairs in each layer
+        # `upload` copies to the device without waiting for its pending work.
         (device_indices,) = upload([host_indices], predictions.scores.device)
         samples, query_inds, joined_inds, gt_inds, rows = device_indices.unbind(0)
         orders = truths.pts_shifts[rows]  # (L, M, S, P, 2 or 3)
@@ -159,7 +160,7 @@ class MapAssigner:
             joined_inds=joined_inds,
             gt_inds=gt_inds,
             rows=rows,
-            order_inds=distances.sum((-1, -2)).argmin(-1),  # (L, M)
+            order_inds=distances.sum((-1, -2)).argmin(-1),  # (L, M), sum over points and axes
             host_labels=labels[host_indices[-1]],  # the last entry of `indices` is `row`
             counts=counts,
         )
@@ -181,7 +182,7 @@ class MapAssigner:
         num_rows = predictions.scores.shape[1]
         # All tensors are copied as one vector, which is then split again. First are the matrices of
         # each sample, one per cost. A sample without ground truth has a check of its scores instead
-        # of matrices. Last are the labels.
+        # of matrices. Last are the labels, which are exact in float32.
         blocks: list[Tensor] = []
         for index, count in enumerate(truths.counts):
             pred = predictions.sample(index)
@@ -217,7 +218,8 @@ class MapAssigner:
         costs: list[Tensor | None] = []
         for cost in self.match_costs:
             if depends_on_class_only(cost):
-                costs.append(cost(all_scores, all_classes).view(scores.shape))
+                class_costs = cost(all_scores, all_classes)  # (B * L * N, classes)
+                costs.append(class_costs.view(scores.shape))
             else:
                 costs.append(None)
         return costs
@@ -229,6 +231,7 @@ def depends_on_class_only(cost: Any) -> bool:
     Args:
         cost: Built cost.
     """
+    # A subclass may read other inputs. With `binary_input`, the cost compares masks.
     return type(cost) is FocalLossCost and not cost.binary_input
 
 
@@ -272,7 +275,7 @@ def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] 
     is_finite = values.isfinite().flatten(1).all(1)
     if not is_finite.all():
         token = (img_meta or {}).get("token", "unknown")
-        name = names[int(is_finite.int().argmin())]
+        name = names[int(is_finite.int().argmin())]  # the first one that is not finite
         raise NotFiniteError(
             f"{name} of sample {token!r} is not finite before the assignment: look at the "
             "sample's images and ground truth, then at the learning rate and at the loss scale "
@@ -281,7 +284,9 @@ def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] 
 
 
 class MapCost:
-    """Base class of matching costs that check the head. Other costs need not derive from it.
+    """Base class of matching costs that need certain outputs of the head, which `check` requires.
+
+    Other costs need not derive from it.
 
     Args:
         weight: Weight of the cost, or a weight for each class, applied to the ground truths of the

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from gsmap.structures.bezier import SAMPLES, bernstein
 
-REACH_PX = 2  # pixels around a point of a curve, in all directions
+REACH_PX = 2  # pixels around a point of a curve, in all directions: a square of 5 x 5
 
 
 def control_points(joints: Tensor, inner: Tensor) -> Tensor:
@@ -24,6 +24,7 @@ def control_points(joints: Tensor, inner: Tensor) -> Tensor:
     joints = joints.sigmoid()
     middles = (joints[..., :-1, :] + joints[..., 1:, :]) / 2
     inner = middles[..., None, :] + inner.sigmoid() - 0.5
+    # Each piece contributes its first joint and its inner points. The last joint ends the curve.
     pieces = torch.cat([joints[..., :-1, None, :], inner], dim=-2)  # (..., k, d, 2)
     return torch.cat([pieces.flatten(-3, -2), joints[..., -1:, :]], dim=-2)
 
@@ -66,7 +67,8 @@ class Curve(nn.Module):
         """Sample the points of curves.
 
         Args:
-            controls: Control points, unused ones at the end. (..., k * d + 1, 2)
+            controls: Control points, unused ones at the end, whose weights are 0.
+                (..., k * d + 1, 2)
             pieces: Index into ``weights``: number of pieces of each curve less one. (...,)
 
         Returns:
@@ -93,12 +95,16 @@ def neighbourhood(points: Tensor, size: Sequence[int]) -> Tensor:
     Returns:
         Points in [0, 1]. (..., 2500, 2)
     """
+    # The square is symmetric, so the sign of the offsets does not matter.
     steps = torch.arange(-REACH_PX, REACH_PX + 1, device=points.device)
-    kernel = torch.cartesian_prod(steps / size[1], steps / size[0])  # offsets (x, y): (25, 2)
-    return (points[..., None, :] - kernel).clamp(0, 1).flatten(-3, -2)
+    offsets = torch.cartesian_prod(steps / size[1], steps / size[0])  # (x, y): (25, 2)
+    return (points[..., None, :] - offsets).clamp(0, 1).flatten(-3, -2)
 
 
 def recovery_loss(values: Tensor) -> Tensor:
-    """Compute the dice loss of mask values whose targets are all 1. (..., P) -> (...,)"""
+    """Compute the dice loss of mask values whose targets are all 1. (..., P) -> (...,)
+
+    The values are read near the points of a true curve, where the mask should be foreground.
+    """
     total = values.sum(dim=-1)
     return 1 - (2 * total + 1) / (total + values.shape[-1] + 1)

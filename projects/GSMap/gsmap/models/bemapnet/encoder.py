@@ -46,7 +46,7 @@ class BezierBEVEncoder(CameraEncoder):
         ValueError: If ``num_layers`` does not have two entries, or the second is less than 1.
     """
 
-    calibration = ("ground_from_img",)
+    calibration = ("ground_from_img",)  # names of the matrices that `encode` receives
 
     def __init__(
         self,
@@ -74,6 +74,8 @@ class BezierBEVEncoder(CameraEncoder):
         self.input_proj = nn.Conv2d(in_channels, embed_dims, kernel_size=1)
         settings = {"num_heads": 8, "ffn_dims": 1024, "dropout": 0.1, **(layer_cfg or {})}
         num_source_layers, num_bev_layers = num_layers
+        # Layers with `to_memory` have self-attention and cross-attention, other layers only the
+        # former.
         self.source_layers = nn.ModuleList(
             AttentionLayer(embed_dims, **settings, to_memory=False)
             for _ in range(num_source_layers)
@@ -109,6 +111,7 @@ class BezierBEVEncoder(CameraEncoder):
         Returns:
             ``bev_feats`` (B, C, H, W) and ``bev_levels``, one map (B, C, H, W) for each BEV layer.
         """
+        # Ground points (B, S, 2), and whether the viewing ray of a pixel meets the ground (B, S).
         points, on_ground = self.ground_points(
             calibration["ground_from_img"], size=feats.shape[-2:], img_shape=img_shape
         )
@@ -126,11 +129,13 @@ class BezierBEVEncoder(CameraEncoder):
         shape = front_size(self.grid)
         cells_yx = centres([shape], feats.device).flip(-1)  # (H * W, 2), row first, in [0, 1]
         cell_centres = self.grid.metres_from_front(cells_yx)
-        cell_points = ahead(cell_centres, self.grid)[None]  # (1, H * W, 2)
+        # As for the pixels: distances ahead and to the left.
+        cell_points = ahead(cell_centres, self.grid)[None]  # (1, H * W, 2), for all samples
         cell_pos = self.positions(cell_points)
         cells = self.bev_embedding.weight.expand(len(feats), -1, -1)  # (B, H * W, C)
         levels = []
         for layer in self.bev_layers:
+            # Cells attend by features and positions (keys), and receive features only (memory).
             cells = layer(
                 cells,
                 cell_pos,
@@ -195,6 +200,7 @@ class BezierBEVEncoder(CameraEncoder):
             Positional encodings. (B, Q, C)
         """
         with torch.autocast(points.device.type, enabled=False):
+            # Each of the two coordinates has half of the channels.
             encoding = coordinate_to_encoding(points, self.embed_dims // 2, scale=1.0)  # (B, Q, C)
         if on_ground is not None:
             encoding = torch.where(on_ground[..., None], encoding, 0.0)

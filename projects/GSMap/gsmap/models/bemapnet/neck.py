@@ -60,7 +60,7 @@ class FusionConv(nn.Module):
     def forward(self, *maps: Tensor) -> Tensor:
         """Fuse maps of equal size. (B, C, h, w) each -> (B, C, h, w)"""
         weights = self.weights.relu()
-        shares = weights / (weights.sum() + 1e-4)
+        shares = weights / (weights.sum() + 1e-4)  # no division by 0 if all weights are negative
         mean = sum(share * feats for share, feats in zip(shares, maps, strict=True))
         return self.norm(self.pointwise(self.depthwise(F.silu(mean))))
 
@@ -77,6 +77,7 @@ class BiFPNRound(nn.Module):
         self.down = nn.ModuleList(FusionConv(2, channels) for _ in range(NUM_LEVELS - 1))
         self.up = nn.ModuleList()
         for level in range(1, NUM_LEVELS):
+            # The coarsest level has no intermediate result, because the first path starts there.
             num_inputs = 2 if level == NUM_LEVELS - 1 else 3
             self.up.append(FusionConv(num_inputs, channels))
 
@@ -85,7 +86,8 @@ class BiFPNRound(nn.Module):
 
         Args:
             levels: Inputs of the path from the coarsest to the finest level.
-            back_levels: Further inputs of the path from the finest to the coarsest level.
+            back_levels: Further inputs of the path from the finest to the coarsest level; the
+                finest entry is not used. After the first round, they equal ``levels``.
         """
         top_down = [levels[-1]]
         for conv, feats in zip(self.down, reversed(levels[:-1]), strict=True):
@@ -132,7 +134,11 @@ class BiFPN(BaseModule):
         self.rounds = nn.ModuleList(BiFPNRound(channels) for _ in range(num_rounds))
 
     def forward(self, feats: Sequence[Tensor]) -> list[Tensor]:
-        """Fuse levels (n, c, h, w), the finest first, to one map. (n, 5 C, *size)"""
+        """Fuse levels (n, c, h, w) of n images, the finest first, to one map.
+
+        Returns:
+            List of one map. (n, 5 C, *size)
+        """
         # The image features are P3 to P5; P6 and P7 are computed from P5.
         sixth = downsample(self.coarser(feats[-1]))
         seventh = downsample(sixth)

@@ -47,6 +47,8 @@ class BEVSelfAttention(BEVDeformableAttention):
     def weights(self, query: Tensor) -> Tensor:
         """Attention weights: a softmax per entry of the queue, divided by the number of entries.
 
+        `forward` of the base class calls this method.
+
         Args:
             query: Both entries of the queue, concatenated along the channels. (B, Q, 2 C)
 
@@ -124,6 +126,7 @@ class BEVEncoderLayer(nn.Module):
             partner = query.repeat_interleave(2, 0)[: len(query)]
         pair = torch.cat([partner, query + query_pos], dim=-1)  # (B, Q, 2 C)
         bev = query.transpose(1, 2).unflatten(-1, (grid.height, grid.width))  # (B, C, H, W)
+        # The self-attention includes its dropout, and the feed-forward network its residual.
         query = self.norms[0](query + self.self_attn(pair, centres, bev))
         query = self.norms[1](query + self.dropout(self.cross_attn(query, feats, projection)))
         return self.norms[2](self.ffn(query))
@@ -154,6 +157,7 @@ class BEVQueryEncoder(CameraEncoder):
         uniform_positions: Initialise the positional encoding from U[0, 1), as intended by
             BEVFormer. MapTR and its successors start from N(0, 1), because their code leaves the
             default of ``nn.Embedding``.
+        init_cfg: Initialisation config of mmengine.
     """
 
     layer_class: ClassVar[type[BEVEncoderLayer]] = BEVEncoderLayer
@@ -199,12 +203,14 @@ class BEVQueryEncoder(CameraEncoder):
                 nn.Linear(embed_dims // 2, embed_dims),
                 nn.ReLU(inplace=True),
             )
+            # Named as in the released code, so that its weights can be loaded.
             self.can_bus_mlp.add_module("norm", nn.LayerNorm(embed_dims))
-        self.num_levels = num_levels
+        self.num_levels = num_levels  # the base class takes this number of levels as `feats`
         layer = {"cross_attn": cross_attn, "embed_dims": embed_dims, **(layer_cfg or {})}
         layers = []
         for _ in range(num_layers):
             layers.append(self.layer_class(**layer))
+        # Number of points per pillar, which the cross-attention determines.
         self.num_heights: int = layers[0].cross_attn.num_heights
         self.layers = nn.ModuleList(layers)
         nn.init.normal_(self.level_embeds)

@@ -33,8 +33,8 @@ class SpatialCrossAttention(SamplingAttention):
     """
 
     # Whether pairs of a cell and a camera that does not show it are computed as well, with weight
-    # 0. `StaticStep` and `StaticFrame` set this before they record a CUDA graph, in which the sizes
-    # of tensors are fixed.
+    # 0. `StaticStep` (training) and `StaticFrame` (inference) set this before they record a CUDA
+    # graph, in which the sizes of tensors are fixed.
     fixed_sizes = False
 
     def __init__(
@@ -60,7 +60,8 @@ class SpatialCrossAttention(SamplingAttention):
         Args:
             query: Queries of the cells. (B, Q, C)
             img_feats: Image features. (B, V, C, h, w), or a list with one such tensor per level
-            projection: Image coordinates of pillars with ``num_heights`` points.
+            projection: Image coordinates ``uv`` of pillars with Z points (B, V, Q, Z, 2), and
+                whether a cell is ``visible`` in a camera (B, V, Q).
 
         Returns:
             Camera features of every cell. (B, Q, C)
@@ -72,10 +73,10 @@ class SpatialCrossAttention(SamplingAttention):
         # `self.num_points` counts the samples of all levels, S * num_parts.
         repeats = self.num_points // (self.num_parts * self.num_heights)
         summed = query.new_zeros(query.shape, dtype=torch.float32)
-        cells = [] if self.fixed_sizes else _visible_cells(projection.visible)
+        visible_cells = [] if self.fixed_sizes else _visible_cells(projection.visible)
         for feats, offset, weight in zip(levels, offsets, weights, strict=True):
             height, width = feats.shape[-2:]
-            offset = offset / constant(query, [width, height])
+            offset = offset / constant(query, [width, height])  # from cells to shares of the map
             # The shape of `value` is (B, V, h * w, heads, C / heads).
             value = self.values(feats.flatten(3).transpose(2, 3)).float()
             if self.fixed_sizes:
@@ -90,7 +91,8 @@ class SpatialCrossAttention(SamplingAttention):
                 continue
             batch, num_views = feats.shape[:2]
             for sample, view in product(range(batch), range(num_views)):
-                cell = cells[sample * num_views + view]  # (T,)
+                cell = visible_cells[sample * num_views + view]  # indices (T,)
+                # Repeated as a whole: sample s lies near the pillar's point s % num_heights.
                 centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
                 locations = centres[:, None] + offset[sample, cell]  # (T, heads, S, 2)
                 sampled = sample_map(
@@ -143,6 +145,7 @@ def _sample_all_pairs(
     """
     visible = projection.visible[..., None, None, None]  # (B, V, Q, 1, 1, 1)
     centres = projection.uv.repeat(1, 1, 1, repeats, 1)[:, :, :, None]  # (B, V, Q, 1, S, 2)
+    # Image coordinates may have any value where a cell is not visible, also NaN.
     locations = torch.where(visible, centres + offsets[:, None], 0)
     pair_weights = weights[:, None] * visible[..., 0]  # (B, V, Q, heads, S)
     sampled = sample_map(

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from mmdet.models.backbones.resnet import BasicBlock
 from torch import Tensor, nn
 
-CAMERA_VECTOR_SIZE = 22
+CAMERA_VECTOR_SIZE = 22  # numbers of `camera_vector`
 
 
 def _conv_bn_relu(
@@ -54,7 +54,10 @@ def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor)
 
 
 class SEGate(nn.Module):
-    """Squeeze-and-excitation gate: features scaled per channel by a sigmoid of an embedding."""
+    """Squeeze-and-excitation gate: features scaled per channel by a sigmoid of an embedding.
+
+    Both layers keep the number of channels; their names are the ones of the released code.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -131,7 +134,7 @@ class CameraAwareDepthNet(nn.Module):
             nn.BatchNorm2d(in_channels),
             nn.ReLU(inplace=True),
         )
-        self.bn = nn.BatchNorm1d(CAMERA_VECTOR_SIZE)
+        self.bn = nn.BatchNorm1d(CAMERA_VECTOR_SIZE)  # the numbers have different units and sizes
         self.context_mlp = _camera_mlp(in_channels)
         self.context_se = SEGate(in_channels)
         self.context_conv = nn.Conv2d(in_channels, context_channels, kernel_size=1)
@@ -151,7 +154,7 @@ class CameraAwareDepthNet(nn.Module):
             camera_vectors: `camera_vector` of each camera. (n, 22)
 
         Returns:
-            Depth logits (n, D, h, w) and context (n, C, h, w).
+            Depth logits, before the softmax over the bins (n, D, h, w), and context (n, C, h, w).
         """
         vectors = self.bn(camera_vectors)
         feats = self.reduce_conv(feats)

@@ -15,6 +15,7 @@ from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import num_depth_bins
 
+# Arguments of `camera_vector`, which makes the input of the camera-aware depth net.
 CAMERA_MATRICES = ("cam2img", "img_aug_matrix", "ego_from_cam")
 
 
@@ -42,7 +43,7 @@ class LSSEncoder(CameraEncoder):
     """
 
     # Whether the sizes of tensors must not depend on values, as in a CUDA graph. Points are then
-    # scattered into cells instead of sorted by cell.
+    # scattered into cells instead of sorted by cell. The code that records a graph sets it to True.
     fixed_sizes = False
 
     def __init__(
@@ -58,12 +59,14 @@ class LSSEncoder(CameraEncoder):
     ) -> None:
         super().__init__(init_cfg)
         self.grid = grid.rasterized(bev_pixel_m)
+        # Cells in which features are summed: half the side of the output's cells.
         self.cells = self.grid.with_size(2 * self.grid.height, 2 * self.grid.width)
         self.z_range = (float(z_range[0]), float(z_range[1]))
         low, high, step = depth_range
         self.depth_range = (float(low), float(high), float(step))
         self.num_bins = num_depth_bins(self.depth_range)
         self.camera_aware = camera_aware
+        # Names of the matrices that the base class collects and passes to `encode`.
         self.calibration = ("frame_from_img",)
         if camera_aware:
             self.calibration += CAMERA_MATRICES
@@ -112,12 +115,15 @@ class LSSEncoder(CameraEncoder):
         if self.camera_aware:
             matrices = {name: calibration[name] for name in CAMERA_MATRICES}
             vectors = camera_vector(**matrices).flatten(0, 1)  # (B * V, 22)
+        # Logits of the D depth bins (B * V, D, h, w), and features to lift (B * V, C, h, w).
         logits, context = self.depth_net(feats.flatten(0, 1), vectors)
         depth = logits.float().softmax(1).unflatten(0, feats.shape[:2])  # (B, V, D, h, w)
         context = context.float().unflatten(0, feats.shape[:2])  # (B, V, C, h, w)
         points = self.points(calibration["frame_from_img"], img_shape, feats)
-        indices = cell_indices(points, self.cells, self.z_range)  # (B, V, D, h, w)
-        # The first convolution is part of the pooling; the layers after it follow below.
+        # Index of the cell of each point, -1 outside of the grid or of `z_range`. (B, V, D, h, w)
+        indices = cell_indices(points, self.cells, self.z_range)
+        # The first convolution is computed together with the sums, which needs fewer operations.
+        # The other layers of `downsample` follow below. The sums need float32, so autocast is off.
         with torch.autocast(feats.device.type, enabled=False):
             kernel = cast(Tensor, self.downsample[0].weight)
             bev = bev_pool_conv3x3(
@@ -141,7 +147,7 @@ class LSSEncoder(CameraEncoder):
         Args:
             frame_from_img: Matrices from (u * d, v * d, d, 1) to metres. (B, V, 4, 4)
             img_shape: Rows and columns of the padded images.
-            feats: Image features. (B, V, C, h, w)
+            feats: Image features, of which only the size and the device are used. (B, V, C, h, w)
 
         Returns:
             Points in metres. (B, V, D, h, w, 3)

@@ -15,7 +15,7 @@ from gsmap.utils.errors import InputError
 
 STEM_CHANNELS = (64, 64, 128)
 STAGE_CHANNELS = ((128, 256), (160, 512), (192, 768), (224, 1024))  # (hidden, output) of each stage
-LAYERS_AND_BLOCKS = {  # layers per block, blocks of the four stages
+LAYERS_AND_BLOCKS = {  # by depth: 3x3 convolutions per block, and blocks of the four stages
     19: (3, (1, 1, 1, 1)),
     39: (5, (1, 1, 2, 2)),
     57: (5, (1, 1, 4, 3)),
@@ -26,7 +26,7 @@ LAYERS_AND_BLOCKS = {  # layers per block, blocks of the four stages
 def _convolution(
     name: str, in_channels: int, channels: int, size: int, stride: int = 1
 ) -> list[tuple[str, nn.Module]]:
-    """Convolution, batch norm and ReLU with their names."""
+    """Convolution, batch norm and ReLU with their names, for an ``OrderedDict``."""
     conv = nn.Conv2d(
         in_channels,
         channels,
@@ -49,7 +49,7 @@ class OneShotAggregation(nn.Module):
     (effective squeeze and excitation, eSE).
 
     Args:
-        name: Prefix of the names of the modules.
+        name: Prefix of the names of the modules, such as ``OSA2_1``.
         channels: Number of channels of the input, of each 3x3 convolution and of the output.
         num_layers: Number of 3x3 convolutions.
         residual: Whether to add the input of the block to its output.
@@ -150,7 +150,7 @@ class VoVNet(BaseModule):
                     name,
                     channels=(in_channels, hidden_channels, out_channels),
                     num_layers=num_layers,
-                    residual=block_index > 0,
+                    residual=block_index > 0,  # the first block changes the number of channels
                 )
                 stage.add_module(name, block)
                 in_channels = out_channels

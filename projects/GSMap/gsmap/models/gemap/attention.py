@@ -73,19 +73,20 @@ class GeometryDecoupledAttention(nn.Module):
         Raises:
             ValueError: If there are fewer than two instances, or not P queries for each.
         """
-        batch, count = query.shape[:2]
-        if count % self.num_points or count < 2 * self.num_points:
+        batch, num_queries = query.shape[:2]
+        if num_queries % self.num_points or num_queries < 2 * self.num_points:
             raise InputError(
                 f"need two or more instances of num_points {self.num_points} queries each, "
-                f"got {count} queries."
+                f"got {num_queries} queries."
             )
-        num_instances = count // self.num_points
+        num_instances = num_queries // self.num_points
         # The first step has no attention within an instance, so there must be another instance.
         blocked = torch.eye(num_instances, dtype=torch.bool, device=query.device)
         if attn_mask is not None:
             blocked = blocked | attn_mask
+        # Repeat each row and column for the P points of its instance.
         blocked = blocked.repeat_interleave(self.num_points, 0)
         blocked = blocked.repeat_interleave(self.num_points, 1)  # (N * P, N * P)
         query = self.inter(query, blocked)
         by_instance = query.reshape(-1, self.num_points, query.shape[-1])  # (B * N, P, C)
-        return self.intra(by_instance).reshape(batch, count, -1)
+        return self.intra(by_instance).reshape(batch, num_queries, -1)

@@ -15,14 +15,17 @@ from gsmap.utils.errors import InputError
 class GaussianGuidance(Guidance, AddsWeights):
     """Conditioning of a decoder layer on the Gaussians of its queries, for any attention.
 
-    Before training it has no effect, so a layer with the weights of MapTR has the output of MapTR:
-    `init_weights` sets the last layer of the embedding to zero, and the matrices of the offsets are
-    identities for the initial Gaussians of a decoder (`GaussianSpace.frames`).
+    Before training it has no effect, so a layer with the weights of MapTR has the output of MapTR.
+    For this, `init_weights` sets the last layer of the embedding to zero. The matrices that
+    transform the sampling offsets are identities for the initial Gaussians of a decoder
+    (`GaussianSpace.frames`).
 
     Args:
-        space: Encoding of Gaussians in references.
+        space: Encoding of Gaussians in references; None for references without Gaussians, which
+            raises the error below.
         embed_dims: Channels C.
-        sampling: Transform sampling offsets by the orientation and size of each Gaussian.
+        sampling: Transform the sampling offsets of deformable attention by the orientation and size
+            of each Gaussian.
         embedding: Add an embedding of (mu, sigma, theta) to the positional queries.
         invariant: Use matrices of the offsets that are equal for theta and theta + pi.
         hidden_dims: Hidden channels of the embedding.
@@ -31,7 +34,9 @@ class GaussianGuidance(Guidance, AddsWeights):
         ValueError: If the references have no Gaussians.
     """
 
-    neutral_keys = ("embedding.",)  # a checkpoint without the zero embedding can be loaded
+    # Prefix of the weights that a checkpoint may lack, such as a checkpoint of MapTR. They then
+    # keep their initial values, which have no effect.
+    neutral_keys = ("embedding.",)
 
     def __init__(
         self,
@@ -87,5 +92,7 @@ class GaussianGuidance(Guidance, AddsWeights):
             return None
         finest = feats if isinstance(feats, Tensor) else feats[0]
         height, width = finest.shape[-2:]
+        # Size of a cell of the map in metres. A transform by a Gaussian in metres needs it for
+        # offsets in cells.
         cell_m = self.space.grid.with_size(height, width).pixel_size_m
         return self.space.frames(reference, invariant=self.invariant, cell_m=cell_m)

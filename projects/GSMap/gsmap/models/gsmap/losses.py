@@ -18,6 +18,9 @@ from gsmap.utils.errors import InputError
 class MaskLoss(MapLoss):
     """Base class of losses of the rendered masks of matched instances.
 
+    `MapLoss` adds up the `values` of all pairs with their weights, and divides by the number of
+    pairs of one layer.
+
     Without overlap of the masks, the gradient has no useful direction. ``full_iou`` therefore
     reduces the loss of pairs with a small overlap.
 
@@ -26,10 +29,10 @@ class MaskLoss(MapLoss):
         full_iou: Smallest soft IoU at which a pair has the full loss, or a value for each class.
             Below it, the loss is multiplied by IoU / full_iou. With 0, all pairs have the full
             loss.
-        flags: Flags of `MapLoss`.
+        flags: Flags of `MapLoss`: ``last_layer_only`` and ``first_group_only``.
     """
 
-    name = "raster"
+    name = "raster"  # logged as loss_raster; a head has at most one loss of this name
 
     def __init__(
         self, loss_weight: WeightConfig = 10.0, full_iou: WeightConfig = 0.0, **flags: bool
@@ -52,9 +55,10 @@ class MaskLoss(MapLoss):
         Returns:
             The reduced losses. (M,)
         """
-        if self.full_iou == 0:
+        if self.full_iou == 0:  # never true for a list with a value for each class
             return losses
         full_iou = class_weights(self.full_iou, pairs.gt_labels)
+        # The factor is a weight of the pair, so it has no gradient.
         iou = soft_iou(pairs.pred_masks.detach(), pairs.gt_masks)
         return losses * torch.where(iou < full_iou, iou / full_iou, 1)
 

@@ -54,6 +54,7 @@ class ErrorReference(GaussianReference):
         # The metainfo of predictions contains the smallest sigma, here 0.05 m, so that an
         # evaluation can count the Gaussians whose sigmas are close to it.
         self.metainfo = {"min_scale_m": self.error_space.floor_m}
+        # `branches` of the base class has one network for each decoder layer.
         self.error_branches = nn.ModuleList(
             layers.mlp(embed_dims + GAUSSIAN_FEATURES, embed_dims, 2) for _ in self.branches
         )
@@ -67,10 +68,12 @@ class ErrorReference(GaussianReference):
     def reset_errors(self) -> None:
         """Set the sigmas of all errors to one value, independent of the input."""
         for branch in self.error_branches:
+            # The last linear layer then returns 0 for any input.
             constant_init(cast(nn.Sequential, branch)[-1], 0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
         """Initial references of n points per query. (..., Q, C) -> (..., Q * n, D)"""
+        # Zeros stand for the initial sigma of `error_space`.
         start = super().start(query_pos)
         return self._with_errors(start, torch.zeros_like(start[..., :2]))
 
@@ -85,10 +88,11 @@ class ErrorReference(GaussianReference):
         Returns:
             The refined references. (..., Q * n, D)
         """
-        points = reference[..., : self.coords]
+        points = reference[..., : self.coords]  # 2 or 3 coordinates
         gaussians = reference[..., -3:]  # sigmas and angle of the rendered Gaussian
         without_errors = torch.cat([points, gaussians], dim=-1)  # (..., Q * n, D - 2)
         refined = super().refine(layer, point_states, reference=without_errors)
+        # One copy of the state for each of its n points.
         states = point_states.repeat_interleave(self.points_per_state, dim=-2)
         inputs = torch.cat([states, self.space.describe(refined)], dim=-1).detach()
         errors = self.error_branches[layer](inputs)  # (..., Q * n, 2)
@@ -153,11 +157,13 @@ class GaussianNLLLoss(MapLoss):
     def values(self, pairs: MatchedPairs) -> Tensor:
         """Negative log-likelihoods along and across the line, averaged over the points. (M, 2)"""
         reference = cast(GaussianReference, pairs.predictions.reference)
+        # One Gaussian per point of the M pairs, centred on the predicted point. (M, P)
         gaussians = reference.errors(pairs.pred_references)
         points = gaussians.means.detach() if self.detach_points else gaussians.means
-        sigma = extents_along_line(gaussians._replace(means=points))  # (M, P, 2)
-        # Absolute errors along and across. (M, P, 2)
+        # Standard deviations and absolute errors; the columns are (along, across). (M, P, 2) each
+        sigma = extents_along_line(gaussians._replace(means=points))
         errors = line_errors(points, pairs.gt_pts_m[..., :2])
+        # Torch's validation of arguments would wait for the GPU.
         distribution: Laplace | Normal
         if self.laplace:
             # A Laplace distribution of scale b has the standard deviation sqrt(2) b.

@@ -30,11 +30,13 @@ def dense_clusters(points: Points, eps: float, min_neighbours: int) -> Indices:
     """
     if not len(points):
         return np.zeros(0, dtype=np.int64)
+    # The shape (E, E), since NumPy returns a scalar for E = 1.
     covariance = np.cov(points, rowvar=False, bias=True).reshape(points.shape[1], -1)
     _, axes = np.linalg.eigh(covariance)
     points = points @ axes[:, ::-1]  # coordinates along the axes, the largest variance first
     order = np.argsort(points[:, 0], kind="stable")
     points = np.ascontiguousarray(points[order].T)  # (E, n): most pairs differ in the first axes
+    # Neighbours of a point lie in low:high, because they differ by at most eps in the first axis.
     low = np.searchsorted(points[0], points[0] - eps)
     high = np.searchsorted(points[0], points[0] + eps, side="right")
     seeds = np.argsort(order)  # position of each given point in the sorted order
@@ -71,14 +73,14 @@ def _clusters(
     is_core = np.zeros(count, np.bool_)
     for i in range(count):
         is_core[i] = _is_core(points, i, low[i], high[i], eps2, min_neighbours)
-    labels = np.full(count, _NOISE)
+    labels = np.full(count, _NOISE)  # points keep this label until a cluster reaches them
     stack = np.empty(count, np.int64)  # points whose neighbours are still to be visited
     # Following the entries from a point leads to the next unlabelled point. The entry of an
     # unlabelled point is the point itself. The last entry, the end of the points, is also itself.
     unlabelled = np.arange(count + 1)
     num_clusters = 0
     for seed in seeds:
-        if not is_core[seed] or labels[seed] != _NOISE:
+        if not is_core[seed] or labels[seed] != _NOISE:  # the latter: already in a cluster
             continue
         labels[seed] = num_clusters
         unlabelled[seed] = seed + 1
@@ -92,7 +94,7 @@ def _clusters(
                 if _are_neighbours(points, point, other, eps2):
                     labels[other] = num_clusters
                     unlabelled[other] = other + 1
-                    if is_core[other]:
+                    if is_core[other]:  # a cluster does not grow from other points
                         stack[depth] = other
                         depth += 1
                 other = _follow_jumps(unlabelled, other + 1)

@@ -1,4 +1,8 @@
-"""HDMapNet's raster layout: columns from rear to front, rows from right to left."""
+"""HDMapNet's raster layout: columns from rear to front, rows from right to left.
+
+The axis of a grid that points ahead is ``grid.forward``, ``"x"`` or ``"y"``. In the grid itself,
+columns run along x and rows along y.
+"""
 
 from typing import Any
 
@@ -10,7 +14,7 @@ from gsmap.structures.grid import BEVGrid
 
 
 def forward_size(grid: BEVGrid) -> tuple[int, int]:
-    """Return the number of rows (across the direction of travel) and of columns (along it)."""
+    """Return the numbers of rows (across the direction of travel) and columns of the layout."""
     if grid.forward == "x":
         return grid.height, grid.width
     return grid.width, grid.height
@@ -42,7 +46,11 @@ def pixels_from_metres(points: NDArray[Any], grid: BEVGrid) -> NDArray[np.float6
 
 
 def metres_from_pixels(pixels: NDArray[Any], grid: BEVGrid) -> NDArray[np.float64]:
-    """Convert continuous pixels (column, row) to points (x, y) in metres. (..., 2) -> (..., 2)"""
+    """Convert continuous pixels (column, row) to points (x, y) in metres. (..., 2) -> (..., 2)
+
+    The inverse of `pixels_from_metres`.
+    """
+    # `grid_pixels` are (column, row) in the grid itself.
     column, row = np.moveaxis(pixels.astype(np.float64), -1, 0)
     if grid.forward == "x":
         grid_pixels = np.stack([column, row], axis=-1)

@@ -20,7 +20,7 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElemen
 from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
-Float32 = np.float32
+Float32 = np.float32  # type of the released code, whose comparisons depend on its rounding
 NONE = -1  # no direction
 
 
@@ -345,10 +345,12 @@ def trace(points: IntArray, directions: IntArray, start: int, config: VectorizeC
     Returns:
         Pixels from one end to the other. (m, 2)
     """
-    is_used = np.zeros(directions.shape, dtype=bool)
+    is_used = np.zeros(directions.shape, dtype=bool)  # directions that need not be followed again
     line = [points[start]]
     line.extend(_walk(line[-1], points, directions, is_used=is_used, config=config))
-    line.reverse()  # the last point is now the start, and the second walk begins there
+    # The last point is now the start. The second walk begins there, in its other direction, because
+    # the first walk has marked one direction as used.
+    line.reverse()
     line.extend(_walk(line[-1], points, directions, is_used=is_used, config=config))
     return np.stack(line)
 
@@ -366,7 +368,7 @@ def _walk(
         # Each round uses up a direction of the last point, with or without a step to a new point.
         column, row = last
         free = np.flatnonzero(~is_used[row, column])
-        if not len(free):
+        if not len(free):  # both directions are used
             return
         first_free = free[0]
         is_used[row, column, first_free] = True
@@ -385,6 +387,7 @@ def _walk(
         nearest = distances.argmin()
         if distances[nearest] > config.jump_px:
             continue
+        # One direction of the new point leads back to the previous point, and must not be followed.
         back = last - remaining[nearest]
         last = remaining[nearest]
         column, row = last

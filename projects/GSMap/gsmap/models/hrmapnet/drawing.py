@@ -20,8 +20,10 @@ def draw_elements(
 ) -> Tensor:
     """Draw elements with soft edges, in one channel per class.
 
-    The value of a pixel is exp(-D / softness), where D is its squared distance from a line, in
-    squared pixels. Areas are filled. Where elements of a class overlap, the largest value is used.
+    D is the squared distance of a pixel from the nearest edge of an element, in squared pixels. For
+    a line, the value of the pixel is exp(-D / softness). Areas are filled: the value is the sigmoid
+    of D / softness inside of an area, and of -D / softness outside. Where elements of a class
+    overlap, the largest value is used.
 
     Args:
         points_m: Points of the elements in metres. (n, P, 2)
@@ -37,7 +39,7 @@ def draw_elements(
         Values in [0, 1]. (classes, H, W)
     """
     raster = points_m.new_zeros((len(classes), grid.height, grid.width))
-    vertices = grid.px_from_metres(points_m)
+    vertices = grid.px_from_metres(points_m)  # (0, 0) is the lower corner of the first pixel
     if not released_pixels:
         # `soft_rasters` samples pixel (row, col) at (col, row), its lower corner. The shift by half
         # a pixel makes it sample the centre.

@@ -85,8 +85,9 @@ class AttentionLayer(nn.Module):
             position: Positional encoding of the tokens, added to queries and keys. (B, Q, C)
             key: Keys of the S vectors of the memory, positional encoding included. (B, S, C)
             memory: Values of the memory. (B, S, C)
-            masks: ``attn_mask`` or ``key_padding_mask`` of `nn.MultiheadAttention`, for the
-                cross-attention, or for the self-attention if there is no memory.
+            masks: ``attn_mask`` or ``key_padding_mask`` of `nn.MultiheadAttention`, True where
+                attention is blocked. They are for the cross-attention, or for the self-attention if
+                there is no memory.
 
         Returns:
             The updated tokens. (B, Q, C)
@@ -99,16 +100,16 @@ class AttentionLayer(nn.Module):
             else:
                 update, _ = self.self_attn(query, query, tokens, need_weights=False, **self_masks)
             tokens = self.norms[index](tokens + self.dropout(update))
-        return self.norms[-1](self.ffn(tokens))
+        return self.norms[-1](self.ffn(tokens))  # `ffn` adds its input to its output
 
 
 @MODELS.register_module()
 class PointLineDecoder(BaseModule):
     """Decoder of point queries with masked cross-attention.
 
-    Each line of n lines per map class has p point queries. The classes and masks of the lines are
-    predicted after each layer. In the next layer, the points of a line attend to the cells of its
-    mask.
+    A map class has n lines, and a line has p point queries. The class logits and the mask of each
+    line, its area in the BEV, are predicted before the first layer and after each layer. In the
+    next layer, the points of a line attend only to the cells of its mask.
 
     Args:
         queries: Number of lines n, and of points p per line, for every map class.
@@ -141,6 +142,7 @@ class PointLineDecoder(BaseModule):
         self.query = nn.Embedding(total, embed_dims)
         self.query_pos = nn.Embedding(total, embed_dims)
         self.level = nn.Embedding(1, embed_dims)  # embedding of the only level of BEV features
+        # Half of the channels encode the row, and half the column.
         self.position = SinePositionalEncoding(embed_dims // 2, normalize=True)
         self.layers = nn.ModuleList(
             AttentionLayer(embed_dims, num_heads, ffn_dims=ffn_dims, memory_first=True)
@@ -171,7 +173,7 @@ class PointLineDecoder(BaseModule):
         # The memory has S = H * W vectors, one per cell. (B, S, C)
         memory = bev.flatten(2).transpose(1, 2) + self.level.weight
         height, width = bev.shape[-2:]
-        no_padding = bev.new_zeros((1, height, width))
+        no_padding = bev.new_zeros((1, height, width))  # the encoding needs a mask of padding
         cell_position = self.position(no_padding).flatten(2).transpose(1, 2)
         key = memory + cell_position
         states = self.query.weight.expand(len(bev), -1, -1)  # (B, Q, C)
@@ -199,6 +201,7 @@ class PointLineDecoder(BaseModule):
             point_states = states_by_class[index].unflatten(1, (-1, p))  # (B, n, p, C)
             line_states = point_states.flatten(2)
             logits = self.cls_branches[index](line_states)
+            # The mask logit of a cell is the dot product of its features with the line's kernel.
             kernels = self.mask_branches[index](line_states)  # (B, n, C)
             masks = torch.einsum("bnc,bchw->bnhw", kernels, bev)
             lines.append(ClassLines(point_states, logits=logits, masks=masks))
@@ -216,6 +219,7 @@ class PointLineDecoder(BaseModule):
         """
         masks = []
         for (_, p), class_lines in zip(self.queries, lines, strict=True):
+            # Logits below 0 are probabilities below 0.5.
             blocked = class_lines.masks.detach().flatten(2) < 0  # (B, n, S)
             is_empty = blocked.all(-1, keepdim=True)
             blocked &= ~is_empty  # for a line with an empty mask, no cell is blocked

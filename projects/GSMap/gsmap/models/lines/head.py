@@ -26,12 +26,13 @@ class LinePredictions(NamedTuple):
     """Predictions of the head after one decoder layer.
 
     Attributes:
-        scores: Logits of the classes, -inf except for the class of the query. (B, N, classes)
+        scores: Logits of the classes, -inf except for the class of the query. N is the number of
+            queries of all classes together. (B, N, classes)
         references: Points of each line, for `Reference.decode` of the head: coordinates
             (B, N, P, 2), or coordinates and the logit by which `decode` selects points.
             (B, N, P, 3)
-        lines: Lines of every class, a NamedTuple of tensors (B, n, ...) with ``logits`` and
-            ``masks``.
+        lines: Lines of every class, each a NamedTuple of tensors (B, n, ...) with ``logits`` and
+            ``masks``. n is the number of queries of the class.
     """
 
     scores: Tensor
@@ -41,6 +42,8 @@ class LinePredictions(NamedTuple):
 
 def class_scores(logits: Sequence[Tensor]) -> Tensor:
     """Class logits of all queries, from the logits of the lines of every class.
+
+    The sigmoid of a class logit is the probability of a line in the softmax of its two logits.
 
     Args:
         logits: Logits of a line and of no line, for every class. (B, n, 2) each
@@ -65,7 +68,7 @@ class LineHead(DetectionHead):
         classes: Names of the classes.
         numbers: Number of line queries of each class.
         decoder: Settings of `PointLineDecoder`.
-        losses: Losses of one class.
+        losses: Costs and losses of the lines of one class, and weights of the losses.
         mask_pixel_m: Side of a pixel in metres, in the masks of lines and classes in training and
             in their targets. A class mask is the union of the masks of all lines of a class.
         score_threshold: Detections need a higher score. With 0.5, a line must be more likely than
@@ -76,7 +79,8 @@ class LineHead(DetectionHead):
         init_cfg: Initialisation config of mmengine.
 
     Attributes:
-        targets: Description of the targets of the transform, for error messages.
+        targets: Description of the targets that the transform in the training pipeline makes, for
+            error messages. The class attribute ``transforms`` names this transform.
         level_weights: Weights of the class masks of the BEV levels. With fewer levels, the last
             weights are used.
 
@@ -115,7 +119,8 @@ class LineHead(DetectionHead):
                 f"for {len(LAYER_WEIGHTS)} layers, got {num_layers}."
             )
         self.layer_weights = LAYER_WEIGHTS[-num_layers:]
-        # Without `margin_m`, lines are kept however far they reach beyond the map.
+        # The coder selects detections by their scores. Without `margin_m`, lines are kept however
+        # far they reach beyond the map.
         self.coder = MapCoder(
             grid, max_num=sum(numbers), margin_m=None, score_threshold=score_threshold
         )
@@ -180,7 +185,7 @@ class LineHead(DetectionHead):
         height, width = self.mask_size
         rows = torch.arange(height, device=device) / height
         cols = torch.arange(width, device=device) / width
-        points = torch.stack(torch.meshgrid(cols, rows, indexing="xy"))  # (2, H, W)
+        points = torch.stack(torch.meshgrid(cols, rows, indexing="xy"))  # (2, H, W), in [0, 1)
         # The last convolution is linear, so it may follow the mean.
         hidden = self.coordinates[:-1](points[None]).mean((2, 3), keepdim=True)
         return self.coordinates[-1](hidden).flatten().float()
@@ -198,6 +203,7 @@ class LineHead(DetectionHead):
         with torch.autocast(feats.device.type, enabled=False):
             truths = [self.truth(sample) for sample in batch_data_samples]
             line_losses, _ = self.line_losses(outputs, truths, tokens=tokens)
+            # Some encoders return the BEV features after each of their layers (levels).
             mask_levels = []
             for level in bev_outputs.get("bev_levels", [feats]):
                 mask_levels.append(self.class_masks(level))
@@ -244,9 +250,10 @@ class LineHead(DetectionHead):
         """
         lines = lines._replace(masks=self.resize_masks(lines.masks))
         truth_masks = [truth.masks for truth in truths]
-        distances = self.losses.distances(lines.masks, truth_masks)
+        distances = self.losses.distances(lines.masks, truth_masks)  # (n, K) for each sample
         for index, token in enumerate(tokens):
-            sample_lines = lines._make(values[index] for values in lines)
+            # `lines` with the tensors of this sample, (n, ...).
+            sample_lines = lines._make(tensor[index] for tensor in lines)
             yield Case(
                 sample_lines, truth=truths[index], mask_distances=distances[index], token=token
             )
@@ -271,7 +278,7 @@ class LineHead(DetectionHead):
         for label in range(len(self.classes)):
             masks = []
             for truth in truths:
-                masks.append(truth[label].masks.sum(0).clamp(max=1))
+                masks.append(truth[label].masks.sum(0).clamp(max=1))  # union of all lines
             targets.append(torch.stack(masks))  # (B, H, W)
         terms = []
         level_weights = self.level_weights[-len(levels) :]
@@ -312,6 +319,8 @@ class LineHead(DetectionHead):
                 groups.append(group)
                 cases.extend(group)
                 weights.append(layer_weight / num_groups)
+        # All cases are matched at once, because each call of `match` waits for the device. It
+        # returns one entry for each case, in their order.
         remaining_matches = self.losses.match(cases)
         totals: Tensors = {}
         matches = []

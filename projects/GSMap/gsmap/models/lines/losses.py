@@ -93,23 +93,23 @@ class LineLosses:
             FloatingPointError: If a cost is not finite. The method `pairs` checks the costs.
         """
         costs_by_case = []
-        values: list[Tensor] = []
-        sizes: list[int] = []
+        flat_costs: list[Tensor] = []
+        lengths: list[int] = []  # number of entries of each cost
         for case in cases:
             costs = self.costs(case)
             costs_by_case.append(costs)
             for cost in costs:
-                values.append(cost.flatten())
-                sizes.append(cost.numel())
-        flat = torch.cat(values)
-        host_values = iter(flat.cpu().split(sizes))
+                flat_costs.append(cost.flatten())
+                lengths.append(cost.numel())
+        vector = torch.cat(flat_costs)
+        host_parts = iter(vector.cpu().split(lengths))  # one part for each cost, in this order
         matches = []
         for case, costs in zip(cases, costs_by_case, strict=True):
             host_costs = []
             for cost in costs:
-                host_costs.append(next(host_values).view(cost.shape))
+                host_costs.append(next(host_parts).view(cost.shape))
             matches.append(self.pairs(case, host_costs))
-        return _upload_tuples(matches, flat.device)
+        return _upload_tuples(matches, vector.device)
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
         """Costs of the matching of a case, of any shapes, on the device."""
@@ -141,6 +141,7 @@ class LineLosses:
 
     def line_costs(self, case: Case) -> Tensor:
         """Weighted costs of classification and masks. (2, n, K)"""
+        # Probability that a prediction is a line, repeated for each annotated line. (n, K)
         score = case.lines.logits.softmax(-1)[:, LINE, None].expand_as(case.mask_distances)
         return torch.stack([-self.cls * score, self.mask * case.mask_distances])
 
@@ -154,10 +155,12 @@ class LineLosses:
         logits = torch.cat([case.lines.logits for case in cases])
         labels = []
         for case, matched_rows in zip(cases, rows, strict=True):
+            # All predictions begin as no line, and the matched ones become lines.
             case_labels = torch.full_like(case.lines.logits[:, 0], 1 - LINE).long()
             case_labels[matched_rows] = LINE
             labels.append(case_labels)
-        weights = constant(logits, [1.0, self.none_weight])  # of a line and of no line
+        # Weights of a line and of no line. `constant` uploads them only once.
+        weights = constant(logits, [1.0, self.none_weight])
         return self.cls * F.cross_entropy(logits, torch.cat(labels), weight=weights)
 
 
@@ -166,9 +169,10 @@ def _upload_tuples(tuples: Sequence[Any], device: torch.device) -> list[Any]:
     tensors: list[Tensor] = []
     for fields in tuples:
         tensors.extend(fields)
-    copies = iter(upload(tensors, device))
+    copies = iter(upload(tensors, device))  # in the order of `tensors`
     result = []
     for fields in tuples:
+        # A NamedTuple of the class of `fields`, filled with the next copies.
         result.append(fields._make(next(copies) for _ in fields))
     return result
 
@@ -185,11 +189,13 @@ def mask_distances(logits: Tensor, masks: Tensor) -> Tensor:
     """
     logits = logits.flatten(1)
     masks = masks.flatten(1)
-    shares = logits.sigmoid()
+    probs = logits.sigmoid()
     # The cross-entropy of a pixel with logit x and target t is softplus(x) - x * t.
     entropy_sums = F.softplus(logits).sum(1, keepdim=True) - logits @ masks.T
     num_pixels = logits.shape[1]
-    sizes = shares.sum(1, keepdim=True) + masks.sum(1)
-    overlaps = 2 * shares @ masks.T
-    dice = (overlaps + 1) / (sizes + 1)
+    # Dice coefficient: twice the overlap of two masks, relative to the sum of their areas. The 1
+    # makes it 1 for two empty masks.
+    areas = probs.sum(1, keepdim=True) + masks.sum(1)  # (n, K)
+    overlaps = 2 * probs @ masks.T
+    dice = (overlaps + 1) / (areas + 1)
     return entropy_sums / num_pixels + 1 - dice

@@ -42,14 +42,15 @@ class MovingPillars:
         img_shape: tuple[int, int],
     ) -> None:
         self.start = start
-        self.heights = start
+        self.heights = start  # `move` replaces them
         self.low_m = z_range[0]
         self.extent_m = z_range[1] - z_range[0]
         self.img_shape = img_shape
         matrices = img_from_frame.float()
+        # Half precision would move the projections by pixels.
         with torch.autocast(feet.device.type, enabled=False):
             self.feet = feet @ matrices.transpose(-1, -2)
-        self.upwards = matrices[:, :, None, None, :, 2]
+        self.upwards = matrices[:, :, None, None, :, 2]  # the column that is multiplied by z
 
     def move(self, offsets_m: Tensor, accumulate: bool) -> PillarProjection:
         """Add offsets to the heights and project the pillars.
@@ -60,7 +61,8 @@ class MovingPillars:
                 added to the initial ones.
 
         Returns:
-            Points in the images, and their visibility.
+            Points in the images, [0, 1] over the padded images (B, V, Q, Z, 2), and whether any
+            point of a pillar is visible to a camera (B, V, Q).
         """
         old_heights = self.heights if accumulate else self.start
         self.heights = old_heights + at_least_float32(offsets_m) / self.extent_m
@@ -143,7 +145,7 @@ class HeightQueryEncoder(BEVQueryEncoder):
 
     def __init__(self, cross_attn: dict[str, Any] | None = None, **kwargs: Any) -> None:
         super().__init__({"type": HeightKernelAttention, **(cross_attn or {})}, **kwargs)
-        kind = type(next(iter(self.layers)).cross_attn)
+        kind = type(next(iter(self.layers)).cross_attn)  # all layers have one config
         if not issubclass(kind, HeightKernelAttention):
             raise InputTypeError(
                 f"HeightQueryEncoder needs HeightKernelAttention, got {kind.__name__}: set "
@@ -160,9 +162,11 @@ class HeightQueryEncoder(BEVQueryEncoder):
             img_shape: Rows and columns of the padded images.
         """
         device = img_from_frame.device
+        # Pillars with one point at z = 0, which are the centres of the cells.
         feet = pillar_points(self.grid, z_range=(0.0, 0.0), num_heights=1, device=device)[:, 0]
         return MovingPillars(
             feet,  # (Q, 4)
+            # `num_heights` is the number of heads of the cross-attention.
             start=torch.linspace(0, 1, self.num_heights, device=device),
             z_range=self.z_range,
             img_from_frame=img_from_frame,

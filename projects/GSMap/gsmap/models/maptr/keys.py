@@ -1,19 +1,23 @@
 """State keys of the released MapTR and their names here, with rules that other models use.
 
-The first two arguments of `rules_of` are the prefixes of keys in the release and here. The text
-lists the rest of each key, as ``released=here`` or as one name that both have.
+`rules_of` makes pairs of key prefixes, one of the release and one here. Its first two arguments are
+the beginnings of the keys in the release and here. Its third argument lists how the keys go on:
+``released=here``, or one name that both have. ``{i}`` stands for the number of a layer. The first
+pair that matches a key is applied.
 """
 
 import torch
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of
 
+# Prefixes in the release.
 HEAD = "pts_bbox_head."
 TRANSFORMER = "pts_bbox_head.transformer."
 ENCODER = "pts_bbox_head.transformer.encoder."
 ENCODER_LAYER = "pts_bbox_head.transformer.encoder.layers.{i}."
 DECODER = "pts_bbox_head.transformer.decoder."
 DECODER_LAYER = "pts_bbox_head.transformer.decoder.layers.{i}."
+# Prefixes here.
 OUR_ENCODER_LAYER = "bev_encoder.layers.{i}."
 LAYER = "map_head.decoder.layers.{i}."
 
@@ -28,6 +32,7 @@ DECODER_RULES = rules_of(
     LAYER,
     "attentions.0.attn.=self_attn. attentions.1.=cross_attn. ffns.0.=ffn. norms.",
 )
+# Rules of both encoders with BEV queries, without the rules of their sampling in cross-attention.
 _BEV_QUERY_RULES = (
     *COMMON_RULES,
     *DECODER_RULES,
@@ -38,7 +43,8 @@ _BEV_QUERY_RULES = (
         ENCODER_LAYER, OUR_ENCODER_LAYER, "attentions.1.output_proj.=cross_attn.output_proj."
     ),
 )
-# Weights of box coordinates, which the releases use only in a loss that they switch off.
+# Weights of box coordinates, which the releases use only in a loss that they switch off. They have
+# no counterpart here. A conversion to the released format writes these values.
 CODE_WEIGHTS = {HEAD + "code_weights": torch.ones(4)}
 
 # Fixed offsets of the cross-attention's kernel, which MapTR's released code saves as a buffer.
@@ -52,7 +58,8 @@ _DEFORMABLE = ENCODER_LAYER + "attentions.1.deformable_attention."
 MAPTR = KeyMap(
     "maptr", (*_BEV_QUERY_RULES, _KERNELS), unused=CODE_WEIGHTS, ignored_pattern=GRID_OFFSETS
 )
-# Checkpoints with the marker keys have deformable cross-attention and are not of MapTR itself.
+# Keys belong to this map only if they contain the marker, in the release or here. Checkpoints with
+# the marker have deformable cross-attention and are not of MapTR itself.
 MAPTR_BEVFORMER = KeyMap(
     "maptr-bevformer",
     (*_BEV_QUERY_RULES, (_DEFORMABLE, OUR_ENCODER_LAYER + "cross_attn.")),
@@ -60,4 +67,4 @@ MAPTR_BEVFORMER = KeyMap(
     markers=((_DEFORMABLE, OUR_ENCODER_LAYER + "cross_attn.sampling_offsets."),),
 )
 
-KEY_MAPS = (MAPTR_BEVFORMER, MAPTR)
+KEY_MAPS = (MAPTR_BEVFORMER, MAPTR)  # MAPTR has no marker and would match both, so it is last

@@ -1,4 +1,8 @@
-"""Losses of MapTR: distances of points and directions of edges."""
+"""Losses of MapTR: distances of points and directions of edges.
+
+The base class `MapLoss` computes the weighted sum of ``values``, and divides it by the average
+factor of the pairs.
+"""
 
 from mmdet3d.registry import MODELS
 from torch import Tensor

@@ -20,7 +20,8 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
     """Add predicted offsets to a reference.
 
     The first ``coords`` entries are a point in (0, 1); its offset is added to its logit. Offsets of
-    further entries (GSMap Eq. 1: sigma and theta before their activation) are added directly.
+    further entries (GSMap Eq. 1: sigma and theta before their activation) are added directly. The
+    computation is at least in float32, because half precision is too coarse for coordinates.
 
     Args:
         reference: References. (..., D)
@@ -57,8 +58,9 @@ class PointReference(nn.Module, RefinedReference):
         coords: Number of coordinates of a point: 2, or 3 with the height.
         z_range: Lowest and highest z in metres, for points with height.
         points_per_state: Number of points n of each query of the decoder. The initial points come
-            from the positional query, and each layer refines them from the state of the query. With
-            more than one point, the networks are larger.
+            from the positional query, and each layer refines them from the state of the query. The
+            decoder has Q queries: one for each point, or with n > 1 one for n points of an
+            instance. With n > 1, the networks are larger.
 
     Raises:
         ValueError: If ``coords`` is not 2 or 3, or 3 without a valid ``z_range``.
@@ -86,7 +88,7 @@ class PointReference(nn.Module, RefinedReference):
         self.coords = coords
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
         self.points_per_state = points_per_state
-        entries = points_per_state * coords
+        entries = points_per_state * coords  # outputs of a network for each query
         self.initial: nn.Module = nn.Linear(embed_dims, entries)
         self.branches = nn.ModuleList()
         if points_per_state > 1:
@@ -158,7 +160,7 @@ class PointReference(nn.Module, RefinedReference):
         A height outside ``z_range`` is clamped to it.
 
         Args:
-            points_m: Points in metres. (..., >= coords)
+            points_m: Points in metres; further coordinates are ignored. (..., >= coords)
 
         Returns:
             Normalised points. (..., coords)

@@ -48,6 +48,7 @@ class DecoupledSelfAttention(nn.Module):
         query = self.norm(self._attend(self.instance_attn, query, pos=instance_pos, mask=attn_mask))
         query = query.unflatten(0, (batch, -1)).transpose(1, 2).flatten(0, 1)  # (B * N, P, C)
         point_pos = query_pos.flatten(0, 1)
+        # The decoder layer normalises the result.
         query = self._attend(self.point_attn, query, pos=point_pos, mask=None)
         return query.unflatten(0, (batch, -1)).flatten(1, 2)  # (B, N * P, C)
 
@@ -55,6 +56,13 @@ class DecoupledSelfAttention(nn.Module):
         self, attention: nn.MultiheadAttention, query: Tensor, pos: Tensor, mask: Tensor | None
     ) -> Tensor:
         """Apply one attention with its residual."""
-        key = query + pos
-        attended, _ = attention(query=key, key=key, value=query, attn_mask=mask, need_weights=False)
+        # The positions are part of queries and keys, but not of values.
+        query_with_pos = query + pos
+        attended, _ = attention(
+            query=query_with_pos,
+            key=query_with_pos,
+            value=query,
+            attn_mask=mask,
+            need_weights=False,
+        )
         return query + self.dropout(attended)

@@ -17,7 +17,7 @@ class DepthSupervision(nn.Module, NeedsTargets):
     Args:
         loss_weight: Weight of the loss.
         name: Name of the loss.
-        kwargs: Arguments of other auxiliary heads; not used.
+        kwargs: Arguments that a map head passes to every auxiliary head (``embed_dims``); not used.
     """
 
     transforms = ("MakeDepthMap",)  # required in the training pipeline
@@ -32,11 +32,12 @@ class DepthSupervision(nn.Module, NeedsTargets):
 
         Args:
             bev_outputs: Outputs of the encoder: ``depth``, the probabilities of the bins
-                (B, V, D, h, w), and ``depth_range``, the bins.
+                (B, V, D, h, w), and ``depth_range``, the start of the first bin, the end of the
+                last bin and the size of a bin, in metres.
             batch_data_samples: Samples with ``gt_depth`` in metres. (V, H, W) each
         """
         probs = bev_outputs["depth"]
         target = stack_targets(self, batch_data_samples, name="gt_depth", device=probs.device)
-        stride = target.shape[-1] // probs.shape[-1]
+        stride = target.shape[-1] // probs.shape[-1]  # pixels of the target per cell of `probs`
         bins = depth_bins(target, stride=stride, depth_range=bev_outputs["depth_range"])
         return self.loss_weight * depth_loss(probs, bins)

@@ -42,7 +42,8 @@ class MapVRHead(MapHead):
             ``points_weight``.
         loss_dice: Settings of the dice loss, or None to train without it.
         dice_cost: Settings of the matching cost of rendered masks, or None to match without it.
-        loss_direction: Settings of `SelfDirectionLoss`, or None to train without it.
+        loss_direction: Settings of `SelfDirectionLoss`, or None to train without it. For these
+            three arguments, ``DEFAULTS`` keeps the default values of the classes.
         points_weight: Weight of the points in losses and matching. None keeps the weights of the
             configs.
         polygons: Names of the classes that are rendered as filled polygons. None means
@@ -80,9 +81,11 @@ class MapVRHead(MapHead):
             raise InputError(f"polygons must be classes of {list(classes)}, got {unknown}.")
         areas = AREA_CLASSES if polygons is None else polygons
         area_inds = tuple(index for index, name in enumerate(classes) if name in areas)
+        # Settings that were passed take precedence over these defaults.
         mask_settings = with_defaults(masks, pixel_m=60 / 256, cost_pixel_m=60 / 128)
         element_masks = ElementMasks(grid, **mask_settings)
         rendering = with_defaults(rendering, polygon_classes=area_inds)
+        # Grids of the masks of losses and of matching. By default, the latter is coarser.
         loss_grid = element_masks.grid
         cost_grid = element_masks.cost_grid
         points_losses = [loss for loss in losses if class_of(loss) is not DirectionLoss]
@@ -96,12 +99,14 @@ class MapVRHead(MapHead):
             key="weight",
             registry=TASK_UTILS,
         )
+        # `optional_part` returns a list of one config, or an empty list for the settings None.
         dice_losses = optional_part(
             RenderedDiceLoss, loss_dice, size=(loss_grid.height, loss_grid.width), **rendering
         )
         dice_costs = optional_part(
             RenderedDiceCost, dice_cost, size=(cost_grid.height, cost_grid.width), **rendering
         )
+        # Changes are made in copies, since the config of the caller must stay as it is.
         layer = {**decoder.get("layer", {}), "dropout": dropout}
         super().__init__(
             grid=grid,

@@ -26,6 +26,7 @@ class PatchMerging(nn.Module):
         height, width = feats.shape[-2:]
         if height % 2 or width % 2:
             raise InputError(f"a BEV level needs even sides to be halved, got {height} x {width}.")
+        # Split each side into h = H / 2 or w = W / 2 pairs of cells.
         patches = feats.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))  # (B, C, h, 2, w, 2)
         # Channel order of the released checkpoints: both rows of the even column, then both rows of
         # the odd column. mmdet's PatchMerging has another order.
@@ -52,7 +53,11 @@ class BEVPyramid(nn.Module):
         self.merges = nn.ModuleList(PatchMerging(embed_dims) for _ in range(num_levels - 1))
 
     def forward(self, bev_feats: Tensor) -> list[Tensor]:
-        """Compute all levels, the finest first. (B, C, H, W) -> (B, C, H / 2^l, W / 2^l) each"""
+        """Compute all levels, the finest first. (B, C, H, W) -> (B, C, H / 2^l, W / 2^l) each
+
+        Raises:
+            ValueError: If a level that is to be halved has an odd side.
+        """
         levels = [bev_feats]
         for merge in self.merges:
             levels.append(merge(levels[-1]))

@@ -71,17 +71,18 @@ class DeformableLayer(nn.Module):
         *norms, last_norm = self.norms
         for attn, norm, (maps, reference) in zip(self.attns, norms, views, strict=True):
             tokens = norm(tokens + attn(tokens + position, reference, feats=maps))
-        return last_norm(self.ffn(tokens))
+        return last_norm(self.ffn(tokens))  # `ffn` adds its input to its output
 
 
 @MODELS.register_module()
 class PivotBEVEncoder(CameraEncoder):
     """BEV encoder with deformable attention over the concatenated cameras (PivotNet).
 
-    The feature maps of all cameras are concatenated from left to right. A BEV cell attends around
-    the projection of its centre on the ground into one camera, or around a learned reference if it
-    is outside that camera's image. In addition to ``bev_feats``, the encoder returns
-    ``bev_levels``, the outputs of all BEV layers.
+    The feature maps of all cameras are concatenated from left to right. The concatenated maps, one
+    per level, are called sources. A BEV cell attends around the projection of its centre on the
+    ground into one camera, or around a learned reference if the projection is outside the image of
+    this camera. In addition to ``bev_feats``, the encoder returns ``bev_levels``, the outputs of
+    all BEV layers.
 
     Args:
         grid: Extent of the map, in metres.
@@ -124,7 +125,7 @@ class PivotBEVEncoder(CameraEncoder):
             raise InputError(f"camera_by must be 'depth' or 'angle', got {camera_by!r}.")
         self.grid = grid.rasterized(bev_pixel_m)
         self.camera_by = camera_by
-        self.shapes = []
+        self.shapes = []  # rows and columns of each source
         for stride in strides:
             height = image_size[0] // stride
             width = num_cams * (image_size[1] // stride)
@@ -140,6 +141,7 @@ class PivotBEVEncoder(CameraEncoder):
         settings = {"embed_dims": embed_dims, **defaults, **(layer_cfg or {})}
         num_source_layers, num_bev_layers = num_layers
         num_levels = len(strides)
+        # A source layer attends to the sources, a BEV layer to the BEV map and then to the sources.
         self.source_layers = nn.ModuleList(
             DeformableLayer(levels=[num_levels], **settings) for _ in range(num_source_layers)
         )
@@ -182,6 +184,7 @@ class PivotBEVEncoder(CameraEncoder):
         # In this method, the BEV cells are in rows from the front to the rear of the map.
         # `turn_raster` brings the results into the layout of `grid`.
         shapes = [front_size(self.grid)]
+        # Centres of the cells in [0, 1] over the BEV map, for the attention to the BEV map.
         cell_reference = centres(shapes, position.device).expand_as(source_reference)
         cells = self.bev_embedding.weight.expand(len(uv), -1, -1)  # (B, H * W, C)
         levels = []
@@ -237,9 +240,11 @@ class PivotBEVEncoder(CameraEncoder):
         """
         matrices = img_from_ground.float()
         # `flip` changes (position from the left, position from the front) to the reverse order.
-        cell_centres = centres([front_size(self.grid)], matrices.device).flip(-1)
+        cell_centres = centres([front_size(self.grid)], matrices.device).flip(-1)  # (Q, 2)
         points = F.pad(self.grid.metres_from_front(cell_centres), (0, 1))  # z = 0
         points = F.pad(points, (0, 1), value=1.0)  # (Q, 4)
+        # Each cell is a pillar of one point: uv in [0, 1] over each image, (B, V, Q, 1, 2), and
+        # whether the point is inside the image, (B, V, Q).
         uv, visible = project_pillars(points[:, None], matrices, img_shape=img_shape)
         score = torch.einsum("bvd,qd->bvq", matrices[:, :, 2], points)  # the depth
         if self.camera_by == "angle":  # depth / distance is the cosine of the angle
@@ -257,7 +262,7 @@ class PivotBEVEncoder(CameraEncoder):
 
 
 def split_maps(tokens: Tensor, shapes: Shapes) -> list[Tensor]:
-    """Split successive cells into maps of given shapes. (B, cells, C) -> (B, C, h, w) each"""
+    """Split successive cells into maps of (rows, columns). (B, cells, C) -> (B, C, h, w) each"""
     sizes = [height * width for height, width in shapes]
-    parts = tokens.transpose(1, 2).split(sizes, dim=2)
-    return [part.unflatten(2, shape) for part, shape in zip(parts, shapes, strict=True)]
+    flat_maps = tokens.transpose(1, 2).split(sizes, dim=2)
+    return [flat.unflatten(2, shape) for flat, shape in zip(flat_maps, shapes, strict=True)]

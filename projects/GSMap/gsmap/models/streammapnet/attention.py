@@ -20,6 +20,8 @@ class LinePointAttention(BEVDeformableAttention):
     def offsets_in_cells(self, query: Tensor) -> Tensor:
         """Compute the learned offsets (x, y) in cells. (B, N, C) -> (B, N, heads, P, 2)"""
         offsets = super().offsets_in_cells(query)
+        # In this library, rows are counted from the smallest y, so y changes its sign. `constant`
+        # returns a tensor on the device of the offsets that is uploaded only once.
         return offsets * constant(offsets, [1.0, -1.0])
 
     def locations(
@@ -40,6 +42,8 @@ class LinePointAttention(BEVDeformableAttention):
         offsets = self.offsets_in_cells(query)  # (B, N, heads, P, 2)
         if frames is not None:
             rotations = frames.unflatten(1, (-1, self.num_points))[:, :, None]  # (B, N, 1, P, 2, 2)
+            # Product of each matrix with its offset.
             offsets = torch.sum(rotations * offsets[..., None, :], dim=-1)
         points = reference[..., :2].unflatten(1, (-1, self.num_points))  # (B, N, P, 2)
+        # Cells are divided by the numbers of columns and rows to get the unit of the points.
         return points[:, :, None] + offsets / constant(offsets, [shape[1], shape[0]])

@@ -46,6 +46,7 @@ class LineReference(PointReference):
             z_range=z_range,
             points_per_state=points_per_state,
         )
+        # From a positional query to the first line, in `start` of the base class.
         self.initial = nn.Linear(embed_dims, num_points * coords)
         hidden_dims = 2 * embed_dims
         branch = nn.Sequential(
@@ -57,13 +58,13 @@ class LineReference(PointReference):
             nn.ReLU(),
             nn.Linear(hidden_dims, num_points * coords),
         )
-        self.branches = nn.ModuleList([branch] * num_layers)
+        self.branches = nn.ModuleList([branch] * num_layers)  # one module for all layers
 
     def init_weights(self) -> None:
         """Initialise the first lines as in the base class, and the branch with Xavier's method."""
         super().init_weights()
         for parameter in self.branches.parameters():
-            if parameter.dim() > 1:
+            if parameter.dim() > 1:  # matrices; biases and layer norms keep their values
                 nn.init.xavier_uniform_(parameter)
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
@@ -77,5 +78,6 @@ class LineReference(PointReference):
         Returns:
             References in [0, 1] over the map. (B, N * P, D)
         """
+        # Without autocast: half precision has too few digits for neighbouring points.
         lines = in_float32(self.branches[layer], point_states).sigmoid()
         return lines.unflatten(-1, (-1, self.coords)).flatten(1, 2)

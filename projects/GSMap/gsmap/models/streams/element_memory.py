@@ -59,7 +59,7 @@ class ElementMemory:
                 "temporal.elements needs gate_m > 0, min_score in [0, 1), noise_m and noise_deg "
                 f">= 0, got {gate_m}, {min_score}, {noise_m} and {noise_deg}."
             )
-        self.num = head.coder.max_num
+        self.num = head.coder.max_num  # largest number of detections of a sample
         self.gate_m = gate_m
         self.min_score = min_score
         self.noise_m = noise_m
@@ -70,12 +70,12 @@ class ElementMemory:
 
         Args:
             results: Detections of each sample, as predicted by the head.
-            past: Memory of the streams and the ego motion.
+            past: Memory of the streams, with the tensors of `remember`, and the ego motion.
 
         Returns:
-            Detections of each sample, unchanged if its stream starts.
+            Detections of each sample, unchanged if its stream starts or the memory is empty.
         """
-        if f"{PREFIX}labels" not in past.memory:
+        if f"{PREFIX}labels" not in past.memory:  # all streams start
             return list(results)
         labels = past.memory[f"{PREFIX}labels"]
         remembered = Gaussians(
@@ -114,7 +114,7 @@ class ElementMemory:
             known_labels=labels[exists],
             gate_m=self.gate_m,
         )
-        # Confident detections get the updated Gaussians, and points keep their heights.
+        # Confident detections get the updated Gaussians. Points of three coordinates keep z.
         means = gaussians.means.index_put((is_confident,), updated.means)
         result = detections.clone()
         result.pts = torch.cat([means, detections.pts[..., 2:]], dim=-1)
@@ -129,7 +129,8 @@ class ElementMemory:
             results: Detections of each sample.
 
         Returns:
-            Tensors by name. (B, max_num, ...) each
+            ``element_labels`` and the Gaussians ``element_means``, ``element_scales`` and
+            ``element_rotations``. (B, max_num, ...) each
         """
         padded_by_name: dict[str, list[Tensor]] = {}
         for detections in results:

@@ -32,6 +32,8 @@ _SINGLE_PRECISION_PREFIXES = ("references", "targets", PREFIX)
 class BatchMemory:
     """Encoder outputs of a batch, the memory recalled for them, and the detections to store.
 
+    Hooks are objects whose methods the head calls between its steps (`FlowHook`).
+
     Args:
         outputs: Outputs of the encoder. Their ``bev_feats`` (B, C, H, W) are fused with the memory.
         past: Memory of the previous frames and the ego motion since then, or None if nothing was
@@ -105,6 +107,7 @@ class StreamMemory(BaseModule):
         self.name = f"a model with {type(head).__name__}"
         self.bev: BEVMemory | None = None
         if bev is not None:
+            # The keywords are defaults of settings that ``bev`` does not contain.
             self.bev = build_part(bev, type="BEVMemory", grid=head.grid, embed_dims=embed_dims)
         self.queries: QueryMemory | None = None
         if queries is not None:
@@ -114,17 +117,18 @@ class StreamMemory(BaseModule):
                     "set temporal.queries=None; temporal.bev works with every head."
                 )
             self.queries = build_part(queries, type="QueryMemory", embed_dims=head.embed_dims)
-            self.queries.check(head)
+            self.queries.check(head)  # raises an error if the head has too few layers or queries
         self.elements: ElementMemory | None = None
         if elements is not None:
             self.elements = build_part(elements, type="ElementMemory", head=head)
         self.streams: Slots | Scenes = Slots(max_gap_s)
 
     def __str__(self) -> str:
+        # A copy of a stream, by pickle for example, recognises its model by this name.
         return self.name
 
     def train(self, mode: bool = True) -> "StreamMemory":
-        """Set the mode, and clear the memory of all streams."""
+        """Set the mode, and clear the memory of all streams. The method `eval` calls it, too."""
         self.streams = Slots(self.max_gap_s) if mode else self.new_scenes()
         return super().train(mode)
 
@@ -148,7 +152,7 @@ class StreamMemory(BaseModule):
         Raises:
             ValueError: If the stream belongs to another model.
         """
-        stream.claim(self)
+        stream.claim(self)  # raises the error above
         model_streams = self.streams
         self.streams = stream
         try:
@@ -177,6 +181,7 @@ class StreamMemory(BaseModule):
             yield BatchMemory(outputs)
             return
         frames = [Frame.from_meta(meta) for meta in metas]
+        # The state that each frame continues, or None where a stream starts.
         states = self.streams.previous(frames)
         past = stack_past(frames, states=states, device=outputs["bev_feats"].device)
         batch = self.recall(outputs, past)
@@ -199,6 +204,7 @@ class StreamMemory(BaseModule):
             The batch with fused ``bev_feats``.
         """
         feats = outputs["bev_feats"]
+        # The fusion keeps the shape of the features and computes in float32.
         if self.bev is not None:
             with torch.autocast(feats.device.type, enabled=False):
                 feats = self.bev(feats.float(), past)
@@ -217,7 +223,8 @@ class StreamMemory(BaseModule):
             results: Detections of each sample.
 
         Returns:
-            Updated detections of each sample.
+            Updated detections of each sample; ``results`` without a memory of elements, or if
+            nothing was recalled.
         """
         if self.elements is None or batch.past is None:
             return results
@@ -262,6 +269,7 @@ def stack_past(
         else:
             motions.append(frame.motion_from(state.frame))
             seconds.append(frame.seconds_after(state.frame))
+    # All three are copied to the device at once: (B, 4, 4), (B,) and (B,).
     now_from_then, elapsed, continues = upload(
         [
             torch.from_numpy(np.stack(motions)),
@@ -270,11 +278,12 @@ def stack_past(
         ],
         device,
     )
-    # All states have values of equal names and shapes, so any one serves as an example.
+    # All states have values of equal names and shapes, so any one serves as an example. If all
+    # streams start, the memory stays empty.
     examples = next((state.values for state in states if state is not None), {})
     memory = {}
     for name, example in examples.items():
-        values = []
+        values = []  # of each frame of the batch
         for state in states:
             values.append(torch.zeros_like(example) if state is None else state.values[name])
         memory[name] = torch.stack(values).to(device)

@@ -36,7 +36,9 @@ class QueryMemory(BaseModule, AddsWeights):
         beta: Distance below which the smooth L1 loss is quadratic, as a fraction of the map.
     """
 
-    neutral_keys = ("fc.",)  # a checkpoint without the network can be loaded, see `init_weights`
+    # Prefixes of weights that a checkpoint may lack. With its initial weights, the network hardly
+    # changes a state (`init_weights`).
+    neutral_keys = ("fc.",)
 
     def __init__(
         self, embed_dims: int, num: int = 33, loss_weight: float = 5.0, beta: float = 0.01
@@ -83,7 +85,7 @@ class QueryMemory(BaseModule, AddsWeights):
         Returns:
             States for the current frame. (B, ..., C)
         """
-        code = motion[:, :3].flatten(1).to(states)  # (B, 12)
+        code = motion[:, :3].flatten(1).to(states)  # (B, 12), type and device of the states
         while code.dim() < states.dim():
             code = code.unsqueeze(1)
         code = code.expand((*states.shape[:-1], -1))
@@ -124,9 +126,13 @@ def by_instance(leaf: Tensor, num: int) -> Tensor:
 
 
 def leaf_names(count: int) -> list[str]:
-    """Return the names of stored leaves, the tensors that `tree_flatten` lists for `Queries`.
+    """Return the names of the leaves of `Queries`, under which the memory stores the tensors.
 
-    The last leaf is the references. The others are the tensors of the state and of the position.
+    `tree_flatten` lists the leaves of nested tuples in a fixed order: the tensors or numbers of the
+    state, then the position, and last the references.
+
+    Args:
+        count: Number of leaves.
     """
     return [*(f"queries_{number}" for number in range(count - 1)), "references"]
 
@@ -202,15 +208,15 @@ class Propagation(FlowHook):
         The propagated queries come first. A stream that starts keeps all its queries, and so do the
         further query groups of training.
         """
-        decoded = head.decoder.read(queries.state, queries.reference)
+        decoded = head.decoder.read(queries.state, queries.reference)  # by instance
         total = decoded.instance_states.shape[1]
         group_size = head.query_groups[0].num
         with torch.no_grad():
             scores = head.cls_branches[0](decoded.instance_states[:, :group_size]).amax(-1)
-        order = self.order(scores, total)
+        order = self.order(scores, total)  # indices into propagated and current queries (B, N)
         # A state may be a nested tuple. Its leaves are tensors or, in place of a tensor, a number
         # such as 0.0. Numbers are not stored in the memory.
-        leaves, form = tree_flatten(queries)
+        leaves, form = tree_flatten(queries)  # `form` rebuilds `Queries` from changed leaves
         remembered = []
         for name, leaf in zip(leaf_names(len(leaves)), leaves, strict=True):
             if isinstance(leaf, Tensor):
@@ -222,12 +228,15 @@ class Propagation(FlowHook):
         for leaf, propagated in zip(leaves, propagated_leaves, strict=True):
             if isinstance(leaf, Tensor):
                 leaf = torch.cat([propagated.to(leaf.dtype), by_instance(leaf, total)], dim=1)
-                leaf = pick(leaf, order).flatten(1, 2)
+                leaf = pick(leaf, order).flatten(1, 2)  # again (B, Q, ...) as in `queries`
             merged.append(leaf)
         return tree_unflatten(merged, form)
 
     def order(self, scores: Tensor, total: int) -> Tensor:
         """Return the order of the queries of the next layer.
+
+        In a stream that continues, the K propagated queries replace the K weakest queries of the
+        first group. In a stream that starts, the current queries keep their order.
 
         Args:
             scores: Largest class logit of the queries of the first group. (B, N of the group)
@@ -272,6 +281,7 @@ class Propagation(FlowHook):
     def targets(self, head: FlowHead, pairs: MatchedPairs) -> None:
         """Store the matched targets of the queries of the last layer."""
         targets = torch.zeros_like(pairs.predictions.pts)
+        # One row for each matched pair: its sample, its query and the points of its ground truth.
         targets[pairs.samples, pairs.query_inds] = pairs.gt_pts.to(targets)
         self.target_pts = targets
 
@@ -306,8 +316,8 @@ class Propagation(FlowHook):
         previous = self.past.memory.get("targets")  # (B, K, P, 2 or 3)
         if self.propagated is None or previous is None:
             # Distributed training requires a gradient of every parameter in every step.
-            parameters = [parameter.sum() for parameter in self.memory.parameters()]
-            return 0.0 * torch.stack(parameters).sum()
+            sums = [parameter.sum() for parameter in self.memory.parameters()]
+            return 0.0 * torch.stack(sums).sum()
         # The branch of the first layer refines the references of the propagated queries.
         state = _flatten_instances(self.propagated.state)
         pred = head.reference.refine(
@@ -317,17 +327,19 @@ class Propagation(FlowHook):
         )
         # The first entries of a reference are its coordinates. (B, K * P, D) -> (B, K, P, 2 or 3)
         pred = pred[..., : previous.shape[-1]].reshape(previous.shape)
+        # Both are in [0, 1] over the map of the current frame.
         target = head.reference.transform_points(previous, self.past.now_from_then)
         has_target = (previous.flatten(2) != 0).any(-1)  # (B, K); unmatched queries have zeros
         weight = has_target & self.past.continues[:, None]
         distances = F.smooth_l1_loss(pred, target, reduction="none", beta=self.memory.beta)
         num_points = previous.shape[-2]
         total = (distances.sum((-1, -2)) * weight).sum() / num_points
+        # The small number avoids a division by 0 if no query has a target.
         return self.memory.loss_weight * total / (weight.sum() + 1e-10)
 
 
 def _flatten_instances(state: Any) -> Any:
-    """Undo `by_instance` in all tensors of a state."""
+    """Undo `by_instance` in all tensors of a state. (B, num, Q / num, ...) -> (B, Q, ...)"""
     leaves, form = tree_flatten(state)
     flat = []
     for leaf in leaves:

@@ -52,7 +52,8 @@ class HeightPlanesEncoder(CameraEncoder):
         self.num_levels = num_levels
         norm = {"type": "GN", "num_groups": min(32, embed_dims)}
         self.upsampling = nn.ModuleList()
-        for level in range(1, num_levels):  # level i is enlarged i times, by a block each time
+        # Level i is enlarged i times, with a convolution before each enlargement.
+        for level in range(1, num_levels):
             blocks = nn.ModuleList()
             for _ in range(level):
                 block = ConvModule(embed_dims, embed_dims, 3, padding=1, bias=True, norm_cfg=norm)
@@ -60,6 +61,7 @@ class HeightPlanesEncoder(CameraEncoder):
             self.upsampling.append(blocks)
         plane_channels = len(heights_m) * (embed_dims + 3)  # features and x, y, z of the points
         self.reduction = nn.Conv2d(plane_channels, embed_dims, kernel_size=3, padding=1)
+        # The stem and the pooling have stride 2 each, and the only stage keeps the size.
         stem, stages = resnet_stages(BasicBlock, embed_dims, widths=[neck_dims])
         pooling = nn.MaxPool2d(3, stride=2, padding=1)
         projection = nn.Conv2d(neck_dims, embed_dims, kernel_size=1, bias=False)
@@ -68,6 +70,7 @@ class HeightPlanesEncoder(CameraEncoder):
         y = torch.linspace(grid.y_range[0], grid.y_range[1], steps=self.grid.height)
         x = torch.linspace(grid.x_range[0], grid.x_range[1], steps=self.grid.width)
         z, y, x = torch.meshgrid(z, y, x, indexing="ij")
+        # The points of the planes follow from the settings, so they are not in checkpoints.
         self.planes: Tensor
         self.register_buffer("planes", torch.stack([x, y, z]), persistent=False)  # (3, Z, H, W)
 
@@ -117,6 +120,7 @@ class HeightPlanesEncoder(CameraEncoder):
         total = feats[0].flatten(0, 1)
         for number, blocks in enumerate(cast(Any, self.upsampling), start=1):
             image = feats[number].flatten(0, 1)
+            # The finer sizes, beginning with the next one.
             for block, size in zip(blocks, reversed(sizes[:number]), strict=True):
                 image = resize_map(block(image), size)
             total = total + image
@@ -128,6 +132,9 @@ class HeightPlanesEncoder(CameraEncoder):
         Args:
             img_from_ground: Transforms from the ground frame in metres to pixels. (B, V, 4, 4)
             img_shape: Rows and columns of the padded images.
+
+        Returns:
+            Image coordinates (B, V, Q, 1, 2), and whether a camera covers the point. (B, V, Q)
         """
         points = F.pad(self.planes.flatten(1).T, (0, 1), value=1.0)  # (Q, 4)
         return project_pillars(points[:, None], img_from_ground, img_shape=img_shape)

@@ -24,7 +24,7 @@ class VectorMapNetAP(ChamferConfig):
     """
 
     name: ClassVar[str] = "vectormapnet"
-    companions: ClassVar[tuple[str, ...]] = ("chamfer",)  # metrics that are reported with it
+    companions: ClassVar[tuple[str, ...]] = ("chamfer",)  # metrics reported before it
 
     @classmethod
     def from_settings(cls, settings: MetricSettings) -> "VectorMapNetAP":
@@ -66,9 +66,10 @@ class ShrunkVectorMapNetAP(VectorMapNetAP):
         """Create the metric from the settings of a command or config.
 
         Raises:
-            ValueError: If the settings ask for heights or for lines that are not resampled.
+            ValueError: If the settings ask for heights or for lines that are not resampled, or have
+                no extent of the map.
         """
-        plain = VectorMapNetAP.from_settings(settings)
+        plain = VectorMapNetAP.from_settings(settings)  # checks the settings
         return cls(plain.classes, grid=settings.canvas)
 
     def match(self, sample: Sample) -> FrameMatches:
@@ -87,6 +88,6 @@ def _shrink(elements: MapElements, grid: BEVGrid) -> MapElements:
     the extent alone. Here elements are scaled about another origin, which does not change
     distances.
     """
-    size = np.array(grid.extent_m)
+    size = np.array(grid.extent_m)  # lengths along x and y, in metres
     points = elements.with_coordinates(2).points * (size / (size + MARGIN_M))
     return replace(elements, points=points)

@@ -126,10 +126,12 @@ class FormatPolylineTargets(BaseTransform):
             boxes.append(bounding_box(line, self.smallest_box))
             tokens.append(tokenize_points(line, canvas.steps))
             weights.append(weigh(line))
+        # `canvas.size` is the number of pixels along x and y. `canvas.steps` is one less, so
+        # that the coordinate 1 belongs to the last pixel.
         border = self.border_px / np.array(canvas.size)
         corners = np.array(boxes).reshape(-1, 2, 2).clip(border, 1 - border)
         instances = results.get("gt_instances_3d", InstanceData())
-        if "pts" not in instances:
+        if "pts" not in instances:  # there is no preceding `FormatMapTargets`
             instances.labels_3d = torch.tensor(labels, dtype=torch.int64)
             instances.pts = torch.from_numpy(pad_lines(lines_m)).float()
             instances.num_pts = torch.tensor(counts, dtype=torch.int64)
@@ -139,6 +141,7 @@ class FormatPolylineTargets(BaseTransform):
         instances.keypoint_tokens = torch.from_numpy(corners * canvas.steps).long().flatten(1)
         instances.tokens = stack_rows(tokens).long()
         instances.token_weights = stack_rows(weights).float()
+        # The detector of the head compares these settings with the settings of its canvas.
         instances.set_metainfo({"canvas": canvas.settings})
         results["gt_instances_3d"] = instances
         return results
@@ -173,6 +176,7 @@ class StretchToPadding(BaseTransform):
         height, width = results["img_shape"]
         padded_height, padded_width = padded_size((height, width), self.pad_size_divisor)
         stretch = np.diag([padded_width / width, padded_height / height, 1.0, 1.0])
+        # Both have one matrix for each camera.
         for key in results.keys() & {"lidar2img", "img_aug_matrix"}:
             results[key] = [stretch @ matrix for matrix in results[key]]
         return results

@@ -7,6 +7,9 @@ from torch import Tensor
 from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.structures.tensors import at_least_float32
 
+# Operators of torch with the kernels of the modules beside this one, which take a backend as a
+# further, last argument. The entries are the name, the arguments, the shape of the output, and the
+# number of tensors, from the first one, that have gradients.
 _sum_rows = fused_operator(
     "deformable_sampling.sum_rows",
     "Tensor table, Tensor weights, Tensor rows",
@@ -17,7 +20,7 @@ _deformable_sample = fused_operator(
     "deformable_sampling.deformable_sample",
     "Tensor value, Tensor locations, Tensor weights, int height, int width",
     lambda value, locations, *_: (*locations.shape[:3], value.shape[3]),  # (B, Q, heads, C)
-    differentiable=3,
+    differentiable=3,  # value, locations and weights
     dtype=torch.float32,
 )
 
@@ -55,7 +58,8 @@ def deformable_sample(
         (B, Q, heads * C)
 
     Raises:
-        ValueError: If ``backend`` is unknown or does not support the inputs.
+        ValueError: If ``"triton"`` does not support the inputs, or if `sum_rows` raises an error
+            for another backend.
     """
     dtype = torch.promote_types(value.dtype, weights.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
@@ -72,6 +76,7 @@ def deformable_sample(
     value = value.to(dtype)
     batch, num_cells, heads, channels = value.shape
     cells, cell_weights = bilinear_cells(locations, weights, shape=shape)  # (B, Q, heads, 4 S)
+    # The rows of the table are ordered by sample, then by cell, then by head.
     sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1)
     head = torch.arange(heads, device=value.device).view(1, 1, -1, 1)
     rows = (sample * num_cells + cells) * heads + head
@@ -98,6 +103,7 @@ def bilinear_cells(
     height, width = shape
     x = locations[..., 0] * width - 0.5
     y = locations[..., 1] * height - 0.5
+    # Column and row of the upper left cell of the four.
     x0 = x.detach().floor()
     y0 = y.detach().floor()
     right = x - x0
@@ -126,11 +132,13 @@ def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto"
         Sums, differentiable in ``table`` and ``weights``. (..., C)
 
     Raises:
-        ValueError: If ``backend`` is unknown or does not support the table.
+        ValueError: If a gradient is needed, and ``backend`` is unknown or does not support the
+            table. Without a gradient, the backend is not used.
     """
     bags = rows.reshape(-1, rows.shape[-1])
     factors = weights.reshape(-1, rows.shape[-1]).to(table.dtype)
     wants_gradient = torch.is_grad_enabled() and (table.requires_grad or factors.requires_grad)
+    # The fused backend has torch's forward pass, and differs in the backward pass only.
     if not wants_gradient or choose_backend(backend, table, fused=("cpu",)) == "reference":
         out = F.embedding_bag(bags, table, per_sample_weights=factors, mode="sum")
     else:

@@ -1,4 +1,7 @@
-"""Sampling of camera features at fixed pixel offsets (kernels) around projected points (GKT)."""
+"""Sampling of camera features at fixed pixel offsets (kernels) around projected points (GKT).
+
+In contrast to these kernels of pixels, a Triton kernel is a program for the GPU.
+"""
 
 import torch
 from torch import Tensor
@@ -7,12 +10,13 @@ from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.kernel_sampling.reference import sample_kernels_reference
 from gsmap.structures.tensors import at_least_float32
 
+# Operator of torch with the Triton kernels, which takes a backend as a further, last argument.
 _sample_kernels = fused_operator(
     "kernel_sampling.sample_kernels",
     "Tensor value, Tensor uv, Tensor weights, Tensor visible_cells, Tensor offsets, int height, "
     "int width, bool bilinear",
     lambda value, uv, weights, *_: (*weights.shape[:3], value.shape[4]),  # (B, Q, heads, C)
-    differentiable=3,  # the first three tensors have gradients
+    differentiable=3,  # value, uv and weights, the first three tensors, have gradients
     dtype=torch.float32,
 )
 
@@ -50,9 +54,10 @@ def sample_kernels(
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
         bilinear: Interpolate between pixels, with zeros outside of the map, instead of rounding to
             the nearest pixel of the map.
-        backend: ``"reference"``, ``"triton"`` or ``"auto"``. ``"triton"`` has one kernel for the
-            forward pass, and one for the backward pass. The latter adds the gradients of the maps
-            in an order that varies, so repeated runs differ by rounding.
+        backend: ``"reference"`` (plain torch), ``"triton"``, or ``"auto"`` for the choice by device
+            and type. ``"triton"`` has one Triton kernel for the forward pass, and one for the
+            backward pass. The latter adds the gradients of the maps in an order that varies, so
+            repeated runs differ by rounding.
 
     Returns:
         Sums, differentiable in ``value``, ``weights`` and, if bilinear, ``uv``. They have the wider

@@ -1,4 +1,7 @@
-"""Sampling of camera features by fixed kernels in plain torch."""
+"""Sampling of camera features by fixed kernels in plain torch.
+
+A kernel is a fixed set of S offsets around a projected point.
+"""
 
 import torch
 from torch import Tensor
@@ -45,7 +48,8 @@ def kernel_pixels(
         offsets: Offsets (dx, dy) of the kernel's S points from its centre, in pixels. (S, 2)
         weights: Weights of the kernel's points. (..., S)
         shape: Rows and columns of the map.
-        bilinear: Interpolate between pixels instead of rounding to one.
+        bilinear: Interpolate between the four pixels around each point of the kernel instead of
+            rounding to one. Pixels outside of the map then have weight 0.
 
     Returns:
         Row-major indices of the pixels, and their weights, both (..., S), or (..., 4 S) if
@@ -91,9 +95,9 @@ def sample_kernels_reference(
     sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1, 1)
     view = torch.arange(views, device=value.device).view(1, 1, -1, 1, 1)
     head = torch.arange(heads, device=value.device).view(1, 1, 1, -1, 1)
-    # Rows of `value` as a table of channels, (B * V * h * w * heads, C).
+    # `value` is read as a table with B * V * h * w * heads rows of C channels.
     rows = ((sample * views + view) * num_pixels + pixels) * heads + head
-    # (B, Q, heads, V * S), with ``bilinear`` (B, Q, heads, V * 4 S)
+    # One sum for each head, over all cameras: (B, Q, heads, V * S), or V * 4 S if bilinear.
     rows = rows.transpose(2, 3).flatten(3)
     weights = weights.transpose(2, 3).flatten(3)
     return sum_rows(value.reshape(-1, channels), rows, weights=weights)

@@ -15,7 +15,9 @@ NORMALIZATIONS = ("both", "foreground", "pixels")
 MIN_FOREGROUND = 0.005
 # Masks per step of the reference, whose intermediate values take 30 times the memory of the masks.
 AT_ONCE = 512
-_EPS = 1e-6
+_EPS = 1e-6  # smallest divisor of the L1 term, for two empty masks
+# Operator of torch with kernels for the CPU (numba) and the GPU (Triton): folder and name of the
+# function, and its arguments in the syntax of a torch schema.
 _raster_loss_sums = fused_operator(
     "raster_loss.raster_loss_sums",
     "Tensor preds, Tensor targets, Tensor window, float weight",
@@ -81,6 +83,7 @@ def raster_loss(
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds = preds.to(dtype)
     targets = targets.detach().to(dtype)
+    # Sums over all pixels would lose precision in the half types of autocast.
     with torch.autocast(preds.device.type, enabled=False):
         backend = choose_backend(backend, preds, kernel="raster_loss")
         if backend != "reference":
@@ -89,7 +92,9 @@ def raster_loss(
                 preds, targets, window=window, weight=foreground_weight, backend=backend
             )
         else:
+            # A checkpoint saves only its inputs for the backward pass.
             parts = []
+            # Without masks there is one empty step, so that there is a tensor to concatenate.
             for start in range(0, max(len(preds), 1), AT_ONCE):
                 part = checkpoint(
                     raster_loss_sums_reference,

@@ -27,7 +27,7 @@ TWO = np.float32(2)
 C1 = np.float32(SSIM_C1)
 C2 = np.float32(SSIM_C2)
 COVERAGE = np.float32(MIN_COVERAGE)
-TAPS = 6  # taps of the window that are added at a time, before the sum is stored
+TAPS = 6  # number of weights of the window that `_convolve` handles in one pass over its output
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
@@ -47,6 +47,7 @@ def _find_spans(preds, targets, radius, spans):
         left = np.int32(width)
         right = np.int32(0)
         for col in range(width):
+            # Without branches, so that the compiler can compute several columns at a time.
             nonzero = (preds[row, col] != 0) | (targets[row, col] != 0)
             left = min(left, np.int32(col) if nonzero else np.int32(width))
             right = max(right, np.int32(col + 1) if nonzero else np.int32(0))
@@ -71,9 +72,10 @@ def _find_spans(preds, targets, radius, spans):
 def _convolve(source, first, stride, window, out, size):
     """Compute out[k] = sum_j window[j] source[first + k + j stride] for k < size.
 
-    The number of weights in ``window`` is a multiple of ``TAPS`` (6).
+    The number of weights in ``window`` is a multiple of ``TAPS`` (6). ``source`` is flat, ``first``
+    is an index in it, and ``stride`` is the step from one weight's value to the next.
     """
-    # Indices are unsigned. For a signed index, numba would add a test whether it is negative and
+    # Indices are unsigned. For a signed index, numba would add a test for a negative index, which
     # counts from the end.
     s_1 = np.uint64(stride)
     s_2 = np.uint64(2 * stride)
@@ -128,7 +130,10 @@ def _blur_row(images, channels, row, span, window, line, out):
 
 @njit(inline="always")
 def _ssim_terms(p, t, squares, product):
-    """Numerators and denominators of SSIM from the blurred p, t, p^2 + t^2 and p t."""
+    """Numerators and denominators of SSIM from the blurred p, t, p^2 + t^2 and p t.
+
+    SSIM is the product of the first two values, divided by the product of the last two.
+    """
     means = p * p + t * t
     top_mean = TWO * p * t + C1
     top_cov = TWO * (product - p * t) + C2
@@ -151,8 +156,9 @@ def _dissimilarity(maps, pixels):
             p, t, squares=maps[4 * k + 2], product=maps[4 * k + 3]
         )
         total += ONE - (top_mean * top_cov) / (low_mean * low_var)
-        # The two numbers have different thresholds, as in the reference: the blurred target must
-        # exceed 0, but the larger one of both blurred masks must exceed `MIN_COVERAGE`.
+        # The two numbers have different thresholds. As in the reference, the first one counts each
+        # pixel with any part of the target in its window, so that the blurred target exceeds 0. For
+        # the second one, the larger of both blurred masks must exceed `MIN_COVERAGE`.
         near_target += 1.0 if t > 0 else 0.0
         near_either += 1.0 if max(p, t) > COVERAGE else 0.0
     return total, near_target, near_either
@@ -210,7 +216,10 @@ def _fill_products(pred, target, weight, out):
 
 @njit(nogil=True, cache=True)
 def _prepare_instance(preds, targets, weight, radius, products, spans, sums):
-    """Compute the spans and products of an instance, and the sums that need no window."""
+    """Compute the spans and products of an instance, and the sums that need no window.
+
+    ``sums`` has the order of ``results`` in `loss_forward`. The sums that need a window become 0.
+    """
     _find_spans(preds, targets, radius=radius, spans=spans)
     products[:] = 0
     sums[:] = 0
@@ -302,7 +311,7 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
     Args:
         preds: Predicted masks in [0, 1], float32. (n, H, W)
         targets: Ground-truth masks in [0, 1], float32. (n, H, W)
-        window: Weights of SSIM's window, see `loss_forward`. (taps,)
+        window: Weights of SSIM's window, with zeros at the end as in `loss_forward`. (taps,)
         radius: Radius of the window in pixels.
         weight: Weight of a foreground pixel, relative to a background pixel, float32.
         factors: Gradient of the loss with respect to the first three sums, float32. (n, 3)
@@ -311,7 +320,7 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
         last: One past the last mask.
     """
     products, slopes, line, maps, spans = _buffers(preds.shape[1:], len(window))
-    unused = np.zeros(7)
+    unused = np.zeros(7)  # output for the sums, which the gradient does not need
     for n in range(first, last):
         # Outside the spans, w is 1, and of the three sums only the sum of w p depends on p.
         grads[n] = factors[n, 1]
@@ -367,11 +376,13 @@ def raster_loss_sums(preds, targets, window, weight):
     Returns:
         Sums, float32. The first three are differentiable in ``preds``. (n, 7)
     """
+    # The kernel adds the values of all pixels in float64, and sets the sums to 0 before.
     sums = torch.empty(len(preds), 7, dtype=torch.float64)
     pixels = preds.shape[1:].numel()
     padded = _pad_window(window)
     radius = len(window) // 2
     weight = np.float32(weight)
+    # Calls the kernel with these arguments and a range of masks (`first`, `last`), in each thread.
     run_in_threads(loss_forward, pixels, preds, targets, padded, radius, weight, sums)
     return sums.float()
 
@@ -394,6 +405,6 @@ def raster_loss_sums_backward(grads, preds, targets, window, weight):
     padded = _pad_window(window)
     radius = len(window) // 2
     weight = np.float32(weight)
-    factors = grads[:, :3]
+    factors = grads[:, :3]  # only the first three sums depend differentiably on the predictions
     run_in_threads(loss_backward, pixels, preds, targets, padded, radius, weight, factors, gradient)
     return (gradient,)

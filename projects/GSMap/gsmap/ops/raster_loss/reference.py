@@ -35,8 +35,8 @@ def gaussian_window(size: int, sigma: float, like: Tensor) -> Tensor:
 def _blur(images: Tensor, window: Tensor) -> Tensor:
     """Filter images with a separable window, zeros outside. (n, H, W), (size,) -> (n, H, W)"""
     pad = len(window) // 2
-    columns = F.conv2d(images[:, None], window.view(1, 1, 1, -1), padding=(0, pad))
-    return F.conv2d(columns, window.view(1, 1, -1, 1), padding=(pad, 0))[:, 0]
+    filtered_rows = F.conv2d(images[:, None], window.view(1, 1, 1, -1), padding=(0, pad))
+    return F.conv2d(filtered_rows, window.view(1, 1, -1, 1), padding=(pad, 0))[:, 0]
 
 
 def dssim_map(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -50,6 +50,7 @@ def dssim_map(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, T
     Returns:
         1 - SSIM in [0, 2], and the weighted means of predictions and of targets, all (n, H, W).
     """
+    # Filter five images of each mask at once: means, means of the squares, mean of the product.
     images = torch.cat([preds, targets, preds.square(), targets.square(), preds * targets])
     mean_p, mean_t, square_p, square_t, product = _blur(images, window).chunk(5)
     var_p = square_p - mean_p.square()

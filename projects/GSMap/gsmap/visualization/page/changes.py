@@ -41,9 +41,9 @@ class ChangeLayer:
         changes = read_changes(path) if path else []
         # Changes that name no map get the name of the only map of the annotation file.
         self._changes = with_map_names(changes, maps, where=str(path))
-        self._is_shown = path is not None
+        self._has_file = path is not None
         self._meta = file.meta
-        self._shown: set[int] = set()
+        self._shown: set[int] = set()  # indices of the changes that `entries` has returned
 
     def entries(self, sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
         """Convert the changes in range of a sample to plain values.
@@ -54,13 +54,14 @@ class ChangeLayer:
 
         Returns:
             A dictionary for each piece of a change in the range: its kind (``kind``), a description
-            (``text``) and its points in centimetres (``p``).
+            (``text``) and its points (``p``), a flat list of (right, ahead) in whole centimetres.
         """
         frame_from_global = invert_rigid(sample.global_from_frame)
         entries = []
         for index, change in enumerate(self._changes):
             if change.map_name != sample.map_name:
                 continue
+            # Only the points are used. The label 0 is arbitrary.
             line = MapElements.from_polylines([change.points], [0]).to_frame(frame_from_global)
             pieces = clip_to_box(line.points, self._meta.x_range, self._meta.y_range)
             if pieces and is_closed(line.points):
@@ -81,7 +82,7 @@ class ChangeLayer:
 
         The list is empty without a file of changes.
         """
-        if not self._is_shown:
+        if not self._has_file:
             return []
         counts = Counter(change.kind for change in self._changes)
         parts = [f"{counts[kind]} {kind}" for kind in KINDS]
@@ -90,7 +91,7 @@ class ChangeLayer:
 
     def tables(self) -> list[Table]:
         """Return a table of all changes, by falling confidence; empty without a file of changes."""
-        if not self._is_shown:
+        if not self._has_file:
             return []
         rows = []
         for change in sorted(self._changes, key=lambda each: -each.confidence):
@@ -127,7 +128,7 @@ def _describe(change: MapChange) -> str:
 
 
 def _row(change: MapChange) -> Sequence[str]:
-    """Return the row of a change in the table."""
+    """Return the row of a change in the table, with the mean of its vertices as its place."""
     x, y = np.mean(change.points, axis=0)
     return [
         change.class_name,

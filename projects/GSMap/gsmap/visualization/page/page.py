@@ -41,6 +41,7 @@ from gsmap.visualization.page.tables import (
 )
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
 
+# Line in ``page.html`` by which pages of this module are recognised.
 _GENERATOR = b'<meta name="generator" content="gsmap">'
 
 
@@ -107,7 +108,8 @@ def page_data(
     """
     file = AnnotationFile(annotations)
     meta = file.meta
-    style = MapStyle(meta.classes)
+    style = MapStyle(meta.classes)  # title and colour of each class
+    # Orientation of the annotation frame: the page shows maps with the vehicle's front at the top.
     view = frame_view(meta.frame, meta.ground_z_m)
     truth: Mapping[str, MapElements] = {}
     if results:
@@ -115,11 +117,12 @@ def page_data(
     scored = _score_results(results, truth=truth, meta=meta, options=options)
     tokens = file.column("token")
     seconds = file.seconds_into_scene
+    # Indices of the samples that are shown, at most `max_frames`, ascending.
     chosen = choose_frames(
         tokens, max_frames=options.max_frames, results=scored, score_thr=options.score_thr
     )
     root = Path(annotations).parent if options.data_root is None else options.data_root
-    layer = ChangeLayer(options.changes, file)
+    layer = ChangeLayer(options.changes, file)  # changes of the map; empty without a file of them
     frames = []
     for index in chosen:
         sample = file[index]
@@ -259,7 +262,7 @@ def _describe_choice(scored: Sequence[ScoredResult], num_chosen: int, max_frames
     """Describe the rule by which frames were chosen (``choose_frames``)."""
     if not scored:
         return "evenly spread"
-    num_worst = max_frames // 4
+    num_worst = max_frames // 4  # as in `choose_frames`
     worst = f"the {num_worst} worst of {scored[0].name}"
     if len(scored) == 2:
         worst = f"{num_worst} in which both results differ most"
@@ -289,11 +292,13 @@ def _tables(
     """
     scene_of = dict(zip(file.column("token"), file.column("scene"), strict=True))
     has_scenes = len(set(scene_of.values())) > 1
+    # Confidence intervals come from random resamples of the scenes.
     resamples = Resamples(scene_of) if has_scenes else None
     tables = [summary_table(scored, resamples), *class_tables(scored, style)]
-    if options.by == DISTANCE:
+    if options.by == DISTANCE:  # the word "distance": bands of the distance from the vehicle
         in_bands = [score_by_distance(result, truth=truth, meta=file.meta) for result in scored]
-        band_tokens = in_bands[0].reports[0].tokens  # one for each sample and band
+        # In these results, each band of a sample counts as a separate sample with its token.
+        band_tokens = in_bands[0].reports[0].tokens
         groups = distance_groups(band_tokens)
         tables += group_tables(in_bands, groups=groups, by=DISTANCE)
     elif options.by:
@@ -303,6 +308,7 @@ def _tables(
         titles = {}
         for (token, scene), seconds in zip(scene_of.items(), file.seconds_into_scene, strict=True):
             titles[token] = _frame_title(scene, seconds)
+        # Samples with the largest differences between both results in F1.
         tables.append(difference_table(scored, titles=titles, score_thr=options.score_thr))
     return tables
 
@@ -321,7 +327,8 @@ def page_html(data: Mapping[str, Any]) -> str:
     template = Template(folder.joinpath("page.html").read_text("utf-8"))
     style = folder.joinpath("page.css").read_text("utf-8")
     script = folder.joinpath("page.js").read_text("utf-8")
-    # The images of each frame are in a separate block, which is parsed when the frame is opened.
+    # The images of each frame are in a separate block, which is parsed when the frame is opened. In
+    # the block, they are listed in the order of the cameras, row by row.
     frames = []
     image_blocks = []
     for frame in data["frames"]:
@@ -337,6 +344,7 @@ def page_html(data: Mapping[str, Any]) -> str:
         frames.append({**frame, "cameras": rows})
         block = _json_block(sources)
         image_blocks.append(f'<script type="application/json" class="images">{block}</script>')
+    # Content security policy of the page. Only a style and a script with these digests are used.
     rules = [
         "default-src 'none'",
         "img-src data:",
@@ -357,6 +365,7 @@ def page_html(data: Mapping[str, Any]) -> str:
 
 def _json_block(value: Any) -> str:
     """Encode a value as JSON that cannot close the HTML element around it."""
+    # Browsers cannot parse NaN, so it is an error here.
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c")
 
