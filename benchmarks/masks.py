@@ -17,14 +17,17 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.ops.raster_loss import raster_loss
 from gsmap.structures.grid import BEVGrid
 
+# Raster of the gradients and of the fit. `missed_line_table` replaces only its size in pixels.
 GRID = BEVGrid(x_range=(-15, 15), y_range=(-30, 30), height=128, width=64)
-POINTS = 20
-BANDS_M = (0.75, 4.0)  # widths of the ground-truth mask
+POINTS = 20  # number of Gaussians per element
+BANDS_M = (0.75, 4.0)  # widths of the band that a line covers in its ground-truth mask
 ERRORS_M = (0.1, 0.5, 1.0, 2.0, 3.0)  # standard deviations of the centres' errors
 SCALES_M = (0.15, 0.25, 0.5, 1.0, 1.5)  # standard deviations of the Gaussians
 LENGTHS_M = (4.0, 10.0, 60.0)  # lengths of missed lines
 RASTER_SIZES = ((128, 64), (200, 100), (256, 128))  # rows and columns of the raster
 # Arguments ``normalize`` and ``foreground_weight`` of `raster_loss`, by the name in the tables.
+# "both" divides the sum over the pixels by the area of both masks, "foreground" by the area of the
+# ground truth, and "pixels" by the area of the raster. The second value weights foreground pixels.
 REDUCTIONS = {
     "both": ("both", 1.0),
     "foreground, weight 5": ("foreground", 5.0),
@@ -44,7 +47,7 @@ def run(args: argparse.Namespace) -> None:
     Args:
         args: Parsed options of ``add_arguments``.
     """
-    parts = [
+    sections = [
         "-dL / d log sigma in thousandths, along / across the line: the loss enlarges Gaussians if "
         "it is positive, and shrinks them if it is negative. "
         f"A line of 60 m, {POINTS} round Gaussians, raster {GRID.height} x {GRID.width}, "
@@ -52,18 +55,18 @@ def run(args: argparse.Namespace) -> None:
     ]
     for reduction in REDUCTIONS:
         for band_m in BANDS_M:
-            parts.append(f"{reduction}, band of {band_m:g} m:\n")
-            parts.append(gradient_table(reduction, band_m, seeds=args.seeds))
-    parts.append("Loss of a miss, by the length of the element:\n")
-    parts.append(missed_line_table())
-    parts.append(
+            sections.append(f"{reduction}, band of {band_m:g} m:\n")
+            sections.append(gradient_table(reduction, band_m, seeds=args.seeds))
+    sections.append("Loss of a miss, by the length of the element:\n")
+    sections.append(missed_line_table())
+    sections.append(
         "Gaussians are fitted to the mask of a crossing of 10 x 4 m. IoU of the polygon through "
         "their centres with the crossing, for two kinds of mask:\n"
     )
-    outline_iou = fit_crossing(False)
-    filled_iou = fit_crossing(True)
-    parts.append(f"outline {outline_iou:.2f}, filled {filled_iou:.2f}\n")
-    publish("\n".join(parts), args.out)
+    outline_iou = fit_crossing(filled=False)
+    filled_iou = fit_crossing(filled=True)
+    sections.append(f"outline {outline_iou:.2f}, filled {filled_iou:.2f}\n")
+    publish("\n".join(sections), args.out)  # prints, and writes to `out` if it is given
 
 
 def straight_line(length_m: float) -> Tensor:
@@ -84,18 +87,18 @@ def scale_gradients(
         band_m: Width of the ground-truth mask in metres.
         error_m: Standard deviation of the centres' error along x and y, in metres.
         scale_m: Standard deviation of the Gaussians in metres.
-        seeds: Number of random errors.
+        seeds: Number of random draws of the errors of all centres.
 
     Returns:
         -dL / d log sigma along and across the line, summed over the Gaussians and averaged over the
-        seeds.
+        draws.
     """
     line = straight_line(60.0)
     errors = torch.randn(seeds, POINTS, 2, generator=torch.Generator().manual_seed(0))
     scales = torch.full((seeds, POINTS, 2), scale_m, requires_grad=True)
-    rotations = torch.full((seeds, POINTS), math.pi / 2)
+    rotations = torch.full((seeds, POINTS), math.pi / 2)  # first axis along the line, which is y
     preds = render_gaussians(line + error_m * errors, scales, rotations=rotations, grid=GRID)
-    targets = draw_polylines(line[None], GRID, band_m).expand_as(preds)
+    targets = draw_polylines(line[None], GRID, band_m).expand_as(preds)  # one mask for all draws
     normalize, weight = REDUCTIONS[reduction]
     loss = raster_loss(preds, targets, foreground_weight=weight, normalize=normalize).sum()
     (gradient,) = torch.autograd.grad(loss, scales)
@@ -110,7 +113,7 @@ def gradient_table(reduction: str, band_m: float, seeds: int) -> str:
     Args:
         reduction: Key of ``REDUCTIONS``.
         band_m: Width of the ground-truth mask in metres.
-        seeds: Number of random errors.
+        seeds: Number of random draws of the errors of all centres.
 
     Returns:
         Markdown table.
@@ -198,5 +201,6 @@ def fit_crossing(filled: bool, iterations: int = 800) -> float:
         optimizer.zero_grad()
         raster_loss(rendered, mask).sum().backward()
         optimizer.step()
+    # A buffer of 0 repairs a polygon whose outline crosses itself.
     polygon = Polygon(centres.detach().numpy()).buffer(0)
     return polygon.intersection(outline).area / polygon.union(outline).area

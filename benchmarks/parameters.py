@@ -25,13 +25,13 @@ def run(args: argparse.Namespace) -> None:
     Args:
         args: Parsed options of ``add_arguments``.
     """
-    cfg = read_config(args.config)
+    cfg = read_config(args.config)  # also registers the classes that the config names
     with building(cfg):  # adds the names of the config and of its parts to errors
         counts = count_parameters(MODELS.build(cfg.model), args.depth)
     width = max(map(len, counts))
     print(f"{'module'.ljust(width)}  {'all':>12}  {'trainable':>12}  {'entries':>12}")
     for name, (parameters, trainable, entries) in counts.items():
-        label = (name or "model").ljust(width)
+        label = (name or "model").ljust(width)  # the name of the whole model is empty
         print(f"{label}  {parameters:>12,}  {trainable:>12,}  {entries:>12,}")
     print("all and trainable are parameters; entries are numbers in a checkpoint, with buffers")
 
@@ -41,12 +41,13 @@ def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, i
 
     Args:
         model: The model.
-        depth: Levels of modules to list, >= 0. Modules without parameters are left out.
+        depth: Levels of modules to list, >= 0; 0 lists only the whole model. Modules without
+            parameters are left out.
 
     Returns:
         By module, the number of parameters, of trainable parameters, and of entries in a
-        checkpoint. Entries include buffers, such as the statistics of batch norms, and a parameter
-        with two names is counted twice.
+        checkpoint. Entries include buffers, such as the statistics of batch norms. A parameter that
+        has two names is one parameter, but its entries are counted twice.
 
     Raises:
         ValueError: If ``depth`` is negative.
@@ -55,7 +56,8 @@ def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, i
         raise InputError(f"depth must be >= 0, got {depth}.")
     counts = {}
     for name, module in model.named_modules():
-        if name and name.count(".") >= depth:
+        level = name.count(".") + 1 if name else 0
+        if level > depth:
             continue
         total = 0
         trainable = 0

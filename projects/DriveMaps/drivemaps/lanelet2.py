@@ -38,9 +38,9 @@ def write_lanelet2(
 
     Args:
         path: File to write.
-        elements: Map in the global frame.
+        elements: Map in the global frame, with x and y in metres and without heights.
         classes: Class names in label order.
-        origin: Position of the global frame on the Earth.
+        origin: Position of the global frame on the Earth, given as a point or as a map grid.
         lanes: Lanelets of the map, written as one-way roads.
         speed_limit_kmh: Speed limit of the lanelets, in km/h.
 
@@ -48,7 +48,8 @@ def write_lanelet2(
         RuntimeError: If ``pyproj`` is missing.
     """
     file = _OSMFile(origin)
-    for line, label, _ in elements.rows:
+    for line, label, _ in elements.rows:  # vertices (P, 2), label and score
+        # A ring has at least three different vertices, and repeats the first one at its end.
         is_ring = len(line) > 3 and bool((line[0] == line[-1]).all())
         vertices = line[:-1] if is_ring else line
         nodes = file.add_nodes(vertices)
@@ -57,7 +58,7 @@ def write_lanelet2(
         if is_ring and name in AREA_CLASSES:
             tags["area"] = "yes"  # polygons of Lanelet2 do not repeat their first node
         elif is_ring:
-            nodes.append(nodes[0])
+            nodes.append(nodes[0])  # the id of the first node closes the line
         file.add_way(nodes, tags)
     if lanes is not None:
         _add_lanelets(file, lanes, speed_limit_kmh)
@@ -65,7 +66,10 @@ def write_lanelet2(
 
 
 def _add_lanelets(file: "_OSMFile", lanes: LaneGraph, speed_limit_kmh: float) -> None:
-    """Add lanelets. The bounds of successive lanelets share their end nodes."""
+    """Add lanelets. The bounds of successive lanelets share their end nodes.
+
+    Lanelet2 recognises successive lanelets by these shared nodes.
+    """
     tags = {
         "type": "lanelet",
         "subtype": "road",
@@ -73,7 +77,8 @@ def _add_lanelets(file: "_OSMFile", lanes: LaneGraph, speed_limit_kmh: float) ->
         "one_way": "yes",
         "speed_limit": f"{speed_limit_kmh:g} km/h",
     }
-    # `entry` and `exit` of a lanelet are indices into these end nodes.
+    # End nodes of the left and the right bounds at each node of the lane graph. `entry` and `exit`
+    # of a lanelet are indices into both lists.
     left_ends = file.add_nodes(lanes.left)
     right_ends = file.add_nodes(lanes.right)
     for lane in lanes.lanelets:
@@ -95,7 +100,8 @@ class _OSMFile:
 
     def __init__(self, origin: MapOrigin | MapGrid) -> None:
         self._origin = origin
-        # The elements of a file are sorted by kind, in the order of these keys.
+        # The elements of a file are sorted by kind, in the order of these keys. So an element only
+        # refers to elements before it.
         self._elements_of_kind: dict[str, list[ElementTree.Element]] = {
             "node": [],
             "way": [],
@@ -103,7 +109,7 @@ class _OSMFile:
         }
 
     def add_nodes(self, points: FloatArray) -> list[str]:
-        """Add points in metres in the global frame and return their ids. (n, 2) -> (n,)"""
+        """Add points in metres in the global frame and return their ids. (n, 2) -> list of n"""
         ids = []
         degrees = self._origin.lon_lat(points).tolist()
         for (x, y), (lon, lat) in zip(points.tolist(), degrees, strict=True):
@@ -122,14 +128,14 @@ class _OSMFile:
         return way.get("id", "")
 
     def add_relation(self, way_of_role: dict[str, str], tags: dict[str, str]) -> None:
-        """Add a relation of ways, given by their ids."""
+        """Add a relation of ways, given by their ids under their roles, such as ``left``."""
         relation = self._add("relation", tags)
         for index, (role, way) in enumerate(way_of_role.items()):  # members go before the tags
             member = ElementTree.Element("member", type="way", ref=way, role=role)
             relation.insert(index, member)
 
     def _add(self, kind: str, tags: dict[str, str]) -> ElementTree.Element:
-        """Add an element with the next id."""
+        """Add an element with the next id. The ids of all kinds are numbered together."""
         num_elements = sum(len(elements) for elements in self._elements_of_kind.values())
         element = ElementTree.Element(kind, id=str(num_elements + 1), version="1")
         for key, value in tags.items():

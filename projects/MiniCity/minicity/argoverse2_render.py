@@ -34,7 +34,7 @@ from minicity.camera import Camera
 from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer
 
-VIEW_M = 50.0  # distance from the track of the vehicle to the edges of the ground
+VIEW_M = 50.0  # distance from the track of the vehicle to the edges of the painted ground
 # Edge of a ground pixel in metres times the number of columns of an image. The product is constant,
 # so wider images get a finer ground: for 800 columns, a ground pixel has an edge of 6.25 cm.
 GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800
@@ -87,7 +87,8 @@ def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int,
     ratio = np.array([width / camera.width_px, height / camera.height_px])
     intrinsics = camera.intrinsics.K.copy()
     intrinsics[:2] *= ratio[:, None]  # focal lengths and principal point
-    intrinsics[:2, 2] += 0.5 * (ratio - 1)  # u + 0.5 is scaled, not u
+    # Pixel coordinate u becomes (u + 0.5) * ratio - 0.5. The principal point is scaled already.
+    intrinsics[:2, 2] += 0.5 * (ratio - 1)
     return intrinsics, width, height
 
 
@@ -119,6 +120,7 @@ def _make_photographer(
         raise InputError(f"{error} in {log.log_dir / 'map'}") from error
     scaled_cameras = {name: scaled_camera(camera, scale) for name, camera in cameras.items()}
     widest = max(width for _, width, _ in scaled_cameras.values())
+    # The seed depends on the log alone. Python's `hash` would differ between processes.
     rng = np.random.default_rng(zlib.crc32(log.log_id.encode()))
     renderer = SceneRenderer(
         make_scene(static_map, heights, bounds=bounds),
@@ -129,6 +131,7 @@ def _make_photographer(
     )
 
     def take_picture(name: str, timestamp_ns: int) -> bytes:
+        # The world of the renderer is the city frame.
         city_from_cam = log.poses[timestamp_ns] @ cameras[name].ego_SE3_cam.transform_matrix
         intrinsics, width, height = scaled_cameras[name]
         camera = Camera(
@@ -174,12 +177,14 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         raise InputError(
             "no calibration of the ring cameras (--calibration-from names another log)"
         )
+    # The keys of the poses are their timestamps in ns, ascending.
     times = thin_out(np.array(list(log.poses)), options.rate_hz)
     if options.max_frames is not None and len(times) > options.max_frames:
         indices = np.linspace(0, len(times) - 1, num=options.max_frames).round().astype(int)
         times = times[indices]
     take_picture = _make_photographer(log, cameras, times_ns=times, scale=options.scale)
     out_dir.parent.mkdir(parents=True, exist_ok=True)
+    # A temporary folder beside `out_dir`, which is removed if an error occurs.
     with partial_path(out_dir, Path.mkdir) as partial_dir:
         _copy_log(log_dir, calibrated_log, target=partial_dir, scale=options.scale)
         for timestamp_ns in times.tolist():
@@ -196,9 +201,10 @@ def _copy_log(log_dir: Path, calibrated_log: Argoverse2Log, target: Path, scale:
     Args:
         log_dir: Folder of the log.
         calibrated_log: Log with the calibration, often the log itself.
-        target: Output folder.
+        target: Output folder, which exists and is empty.
         scale: Size of the pictures relative to the real images, in (0, 1].
     """
+    # `copyfile` copies contents without permissions, because the files of a log may be read-only.
     shutil.copytree(log_dir / "map", target / "map", copy_function=shutil.copyfile)
     shutil.copyfile(log_dir / POSE_TABLE, target / POSE_TABLE)
     (target / "calibration").mkdir()
@@ -247,6 +253,8 @@ def render_logs(
 
     Raises:
         OSError: If a file cannot be written.
+        RuntimeError: If a worker dies, or a log takes longer than an hour.
+        ValueError: If ``workers`` is below 1.
     """
     render = partial(_try_log, out=out, options=options)
     workers = min(workers, max(len(log_dirs), 1))
@@ -283,14 +291,19 @@ def run(arguments: argparse.Namespace) -> str:
         arguments: Parsed options of ``add_arguments``.
 
     Returns:
-        Summary for the user.
+        Summary for the user (`render_logs`).
+
+    Raises:
+        FileNotFoundError: If the split or a log is missing.
+        ValueError: If an option is out of range.
     """
     root = arguments.root
     split = arguments.split
     calibration = None
     if arguments.calibration_from:
         calibration = find_logs(root, split, [arguments.calibration_from])[0]
+    # The other fields of the options have the names of arguments.
     options = options_from(RenderOptions, arguments, calibration=calibration)
-    log_dirs = arguments.shard.part(find_logs(root, split, arguments.logs))
+    log_dirs = arguments.shard.part(find_logs(root, split, arguments.logs))  # all without --shard
     out = arguments.out / (arguments.out_split or split)
     return render_logs(log_dirs, out, options=options, workers=arguments.workers)

@@ -1,4 +1,8 @@
-"""One scene of MiniCity: its drive, pictures, sweeps and records."""
+"""One scene of MiniCity: its drive, pictures, sweeps and records.
+
+A record is a row of a table of nuScenes. A key frame, which nuScenes calls a sample, has pictures,
+a LiDAR sweep and annotated objects. Between key frames, the LiDAR takes further sweeps.
+"""
 
 import json
 import math
@@ -39,10 +43,10 @@ GROUND_MARGIN_M = 48.0  # ground beyond the drive
 BUILDING_REACH_M = 130.0  # distance of visible buildings from the drive
 PLANT_REACH_M = 90.0  # distance of visible trees and poles from the drive
 BOX_REACH_M = 55.0  # distance of annotated objects from the LiDAR
-BOX_SLACK_M = 0.05  # added to a box on each side
+BOX_SLACK_M = 0.05  # added to a box on each side when the LiDAR points inside are counted
 JPEG_QUALITY = 90
 FIRST_TIMESTAMP_US = 1_600_000_000_000_000
-Records = dict[str, list[dict[str, Any]]]
+Records = dict[str, list[dict[str, Any]]]  # records by the name of their table
 
 
 @dataclass(frozen=True)
@@ -86,8 +90,11 @@ class SceneMaker:
         self.town = town
         self.root = root
         self.records: Records = defaultdict(list)
+        # The last sample is at the end of the scene.
         self.duration_s = SAMPLE_PERIOD_S * (config.samples_per_scene - 1)
         self.samples = [self._token("sample", k) for k in range(config.samples_per_scene)]
+        # All passes of a street share the random numbers of its first scene (`route`), so that they
+        # have one path. `vary_drive` then changes the later passes.
         self.ego: Drive = plan_ego(
             town,
             task.index_in_town,
@@ -101,6 +108,7 @@ class SceneMaker:
             town, self.ego, duration_s=self.duration_s, rng=self._rng("traffic")
         )
         self.renderer = self._make_renderer()
+        # Corners and heights of all buildings, as the LiDAR takes them. (n, 9)
         self.building_boxes = footprint_array(
             footprints=[building.footprint for building in town.buildings],
             heights=[building.height_m for building in town.buildings],
@@ -108,11 +116,11 @@ class SceneMaker:
         self.tilt_phases_rad = self._rng("tilt").uniform(low=0, high=2 * np.pi, size=2)
 
     def _rng(self, *parts: object) -> np.random.Generator:
-        """Random generator for a part of the scene."""
+        """Random generator that depends only on the seed, the scene and ``parts``."""
         return make_rng(self.config.seed, self.task.name, *parts)
 
     def _token(self, *parts: object) -> str:
-        """Token of a record of the scene."""
+        """Token of a record, which depends only on the seed, the scene and ``parts``."""
         return make_token(self.config.seed, self.task.name, *parts)
 
     def _add(self, table: str, **record: Any) -> None:
@@ -121,9 +129,10 @@ class SceneMaker:
 
     def _make_renderer(self) -> SceneRenderer:
         """Create the renderer of the ground and of the objects around the drive."""
-        # The cameras of the first key frame are exposed before time 0.
+        # Cameras are exposed shortly before their key frame, so the track begins before time 0.
         times = np.linspace(-0.1, self.duration_s, num=12).tolist()
         track = np.array([self.ego.pose(t)[:2] for t in times])
+        # Bounds of the ground in the world in metres.
         xmin, ymin = (track.min(axis=0) - GROUND_MARGIN_M).tolist()
         xmax, ymax = (track.max(axis=0) + GROUND_MARGIN_M).tolist()
         bounds = (xmin, ymin, xmax, ymax)
@@ -177,6 +186,7 @@ class SceneMaker:
             if k < last:
                 for j in range(1, self.config.sweeps_per_sample + 1):
                     self._sweep(k, j)
+        # Neighbours in time are known only now.
         self._link_lidar()
         self._link_annotations()
         start_us = self.timestamp_us(0.0)
@@ -191,6 +201,7 @@ class SceneMaker:
 
     def _add_scene(self) -> None:
         """Add the log and scene records."""
+        # A field that nuScenes does not have: the map of the streets before they are repainted.
         expansion = {}
         if self.task.expansion != self.task.location:
             expansion["map_expansion"] = self.task.expansion
@@ -215,7 +226,13 @@ class SceneMaker:
         )
 
     def _add_data(self, channel: str, time_s: float, **data: Any) -> None:
-        """Add a ``sample_data`` record, and an ``ego_pose`` record with equal token and time."""
+        """Add a ``sample_data`` record, and an ``ego_pose`` record with equal token and time.
+
+        Args:
+            channel: Channel of the sensor in nuScenes.
+            time_s: Time of the data since the scene's start, in seconds.
+            data: Further fields of the ``sample_data`` record, with its ``token``.
+        """
         pose = self.ego_pose(time_s)
         token = data["token"]
         timestamp = self.timestamp_us(time_s)
@@ -307,7 +324,7 @@ class SceneMaker:
         return cloud
 
     def _link_lidar(self) -> None:
-        """Chain the LiDAR records by time."""
+        """Chain the LiDAR records of key frames and sweeps by time."""
         sweeps = [d for d in self.records["sample_data"] if "LIDAR_TOP" in d["filename"]]
         sweeps.sort(key=lambda d: d["timestamp"])
         _chain(sweeps)
@@ -324,6 +341,7 @@ class SceneMaker:
         points = cloud[:, :3] @ pose[:3, :3].T + pose[:3, 3]
         for actor in self.actors:
             vehicle = actor.at(time_s)
+            # The LiDAR is at the origin of `pose`.
             if np.linalg.norm(vehicle.center[:2] - pose[:2, 3]) > BOX_REACH_M:
                 continue
             num_points = _points_in_box(points, vehicle)
@@ -414,7 +432,8 @@ def _make_surroundings(
     """
     mesh = Mesh()
     shadows = []
-    # Shift of the shadow of a point per metre of its height.
+    # Shift of the shadow of a point per metre of its height. `LOWEST_SUN` is the smallest sine of
+    # the sun's elevation that is used, which limits the length of shadows.
     shadow_shift = -lighting.sun[:2] / max(float(lighting.sun[2]), LOWEST_SUN)
 
     def track_distance(points: Array) -> Array:
@@ -426,6 +445,7 @@ def _make_surroundings(
         for i in np.flatnonzero(track_distance(centers) < BUILDING_REACH_M):
             building = town.buildings[i]
             add_building(mesh, building, lit_windows=lighting.weather == "dusk")
+            # The shadow is the convex hull of the walls' base and of the shadow of the roof.
             roof_shadow = building.footprint + shadow_shift * building.height_m
             corners = shapely.MultiPoint(np.concatenate([building.footprint, roof_shadow]))
             shadows.append(np.array(corners.convex_hull.exterior.coords))

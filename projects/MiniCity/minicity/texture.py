@@ -1,4 +1,7 @@
-"""Texture of the ground from above, at several resolutions."""
+"""Texture of the ground from above, at several resolutions.
+
+Level 0 is the finest resolution. The renderer reads distant ground from coarser levels.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,10 +16,10 @@ from minicity.scene_map import MATERIALS, PAINTS, SceneMap
 
 SHIFT = 4  # fractional bits of OpenCV's fixed-point coordinates
 TILE_PX = 1024  # edge of the noise tiles
-LEVELS = 6  # resolutions of the colour image
+LEVELS = 6  # number of resolutions of the colour image
 BLOTCH_WEIGHT = 0.16  # weight of the large noise in the brightness of the ground
 GRAIN_WEIGHT = 0.75  # weight of the fine noise in the brightness of the ground
-Image = MatLike
+Image = MatLike  # array of OpenCV, here always of numpy
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ def _noise_tiles() -> tuple[Image, Image]:
     """
     rng = np.random.default_rng(20)
     blotches = np.zeros((TILE_PX, TILE_PX), dtype=np.float32)
+    # Cells along an edge of the tile, and weight of their noise: from coarse to fine.
     for cells, weight in ((16, 1.0), (64, 0.8), (256, 0.6), (512, 0.5)):
         # Random values on a coarse grid, enlarged by smooth interpolation. One more cell on each
         # side, from the opposite side, makes the noise periodic.
@@ -79,7 +83,7 @@ def _noise_tiles() -> tuple[Image, Image]:
 def _tile_noise(tile: Image, shape: tuple[int, int], start: list[int]) -> Image:
     """Repeat a periodic tile, shifted by (rows, columns), up to the size (rows, columns). (H, W)"""
     shifted = np.roll(tile, (start[0], start[1]), axis=(0, 1))
-    repeats = [-(-n // TILE_PX) for n in shape]  # rounded up
+    repeats = [-(-n // TILE_PX) for n in shape]  # number of tiles along each axis, rounded up
     return np.tile(shifted, repeats)[: shape[0], : shape[1]]
 
 
@@ -135,6 +139,7 @@ def paint_ground(
         )
         if coat is not None:
             window, alpha = coat
+            # `color[window]` is a view, so the texture itself is changed.
             _blend(color[window], PAINTS[marking.paint], alpha=alpha)
             opacity[window] = np.maximum(opacity[window], alpha)
     gray = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
@@ -142,7 +147,8 @@ def paint_ground(
         origin=origin,
         resolution_m=resolution_m,
         levels=_halve_repeatedly(color),
-        # Paint reflects laser pulses more strongly than the ground.
+        # Paint reflects laser pulses more strongly than the ground: the weighted sum of brightness
+        # and opacity of the paint.
         reflectivity=cv2.addWeighted(gray, 0.12, opacity, beta=0.45, gamma=0),
     )
 
@@ -154,6 +160,7 @@ def _halve_repeatedly(color: Image) -> list[Image]:
         rows, columns = levels[-1].shape[:2]
         half_rows = max(1, rows // 2)
         half_columns = max(1, columns // 2)
+        # Without an odd last row or column, each new pixel is the mean of 2 x 2 pixels.
         even = levels[-1][: 2 * half_rows, : 2 * half_columns]
         levels.append(cv2.resize(even, (half_columns, half_rows), interpolation=cv2.INTER_AREA))
     return levels
@@ -163,7 +170,7 @@ def _paint_surfaces(color: Image, scene: SceneMap, origin: Array, resolution_m: 
     """Fill the surfaces of a scene in an image (H, W, 3), in place."""
     for surface in scene.surfaces:
         shade = [min(255.0, c * surface.tone) for c in MATERIALS[surface.material]]
-        outlines = []
+        outlines = []  # the outer edge and the holes; `fillPoly` leaves the holes unchanged
         for ring in (surface.polygon.exterior, *surface.polygon.interiors):
             outlines.append(_fixed_point_pixels(np.array(ring.coords), origin, resolution_m))
         cv2.fillPoly(color, outlines, color=shade, lineType=cv2.LINE_AA, shift=SHIFT)
@@ -173,7 +180,8 @@ def _paint_kerbs(color: Image, scene: SceneMap, origin: Array, resolution_m: flo
     """Draw the kerbs of a scene in an image (H, W, 3): a light band with a dark gutter in it."""
     for line in scene.kerbs:
         px = _fixed_point_pixels(line, origin, resolution_m)
-        for width_m, shade in ((0.34, (172, 178, 180)), (0.1, (58, 58, 58))):  # BGR
+        # Width in metres and BGR colour of the band, then of the gutter, which is drawn over it.
+        for width_m, shade in ((0.34, (172, 178, 180)), (0.1, (58, 58, 58))):
             cv2.polylines(
                 color,
                 [px],
@@ -228,6 +236,7 @@ def _paint_coat(
     # above, with a soft edge in between.
     noise = np.arange(256) / 255.0
     cover = np.clip((1.0 - wear - noise) * 5 + 0.35, 0.12, 0.97)
+    # The table has the opacity for each of the 256 values of the noise.
     cover_px = cv2.LUT(blotches[window], (cover * 255).astype(np.uint8))
     return window, cv2.multiply(mask, cover_px, scale=1 / 255)
 
@@ -252,7 +261,8 @@ def darken(texture: GroundTexture, outlines: list[Array], strength: float) -> Gr
         strength: Share of the light that is lost in a shadow, in [0, 1].
 
     Returns:
-        A texture with shadows. Its reflectivity is not changed.
+        A texture with shadows, or ``texture`` itself if nothing is darkened. The reflectivity is
+        not changed, because laser pulses do not depend on daylight.
     """
     if not outlines or strength <= 0:
         return texture
@@ -262,6 +272,7 @@ def darken(texture: GroundTexture, outlines: list[Array], strength: float) -> Gr
     for outline in outlines:
         px = _fixed_point_pixels(outline, texture.origin, texture.resolution_m)
         cv2.fillPoly(light, [px], color=(shade,), lineType=cv2.LINE_AA, shift=SHIFT)
+    # The blur reaches 15 cm into and out of a shadow.
     radius_px = max(1, round(0.15 / texture.resolution_m))
     size_px = 2 * radius_px + 1
     light = cv2.blur(light, (size_px, size_px))

@@ -14,13 +14,13 @@ from minicity.roads import Lane, Road
 from minicity.town import Town
 from minicity.vehicles import Vehicle
 
-# Category, size in metres and share of all vehicles.
+# Category of nuScenes, size (length, width, height) in metres, and share of all moving vehicles.
 KINDS: list[tuple[str, tuple[float, float, float], float]] = [
     ("vehicle.car", (4.5, 1.85, 1.55), 0.78),
     ("vehicle.truck", (6.6, 2.2, 2.7), 0.14),
     ("vehicle.bus.rigid", (10.8, 2.5, 3.2), 0.08),
 ]
-CAR_KIND = 0
+CAR_KIND = 0  # index of cars in ``KINDS``
 # Colours of vehicles and clothes, BGR.
 PAINTS: list[Color] = [
     (225, 225, 225),
@@ -33,13 +33,15 @@ PAINTS: list[Color] = [
 ]
 REACH_M = 75.0  # largest distance of traffic from the drive of the ego vehicle
 _LONGEST_SCENE_S = 20  # the paths of other vehicles are long enough for this time
-SWING_M = 6.0  # distance in which the phase of a swing grows by 1 radian
+SWING_M = 6.0  # distance in metres in which the phase of a swing grows by 1 radian
 PASS_START_M = 3.0  # the start of another pass is shifted by at most this, forward or backward
 
 
 @dataclass(frozen=True)
 class Drive:
     """Drive along a path at constant speed, swinging gently around the lane's centre.
+
+    The drive ends at the end of the path, where the vehicle stops.
 
     Attributes:
         path: Centre lines of successive lanes, concatenated, in metres. (n, 2)
@@ -58,7 +60,10 @@ class Drive:
     shift_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Tabulate the path as plain lists, from which ``pose`` reads single entries."""
+        """Tabulate the path as plain lists, from which ``pose`` reads single entries quickly.
+
+        A row has the position x, y and the unit tangent x, y of a point of the path.
+        """
         lengths = arc_lengths(self.path)
         rows = np.column_stack([self.path, tangents(self.path)])
         object.__setattr__(self, "_lengths", lengths.tolist())
@@ -80,6 +85,7 @@ class Drive:
         phase = self.swing_rad + arc_m / SWING_M
         side = self.shift_m + self.swing_m * math.sin(phase)  # offset to the left of the path
         slope = self.swing_m * math.cos(phase) / SWING_M  # derivative of `side` by `arc_m`
+        # The normal to the left of the path is (-dy, dx).
         return x - side * dy, y + side * dx, math.atan2(dy, dx) + math.atan(slope)
 
 
@@ -100,9 +106,10 @@ def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Genera
     pieces = [first.center]
     total = float(arc_lengths(first.center)[-1])
     while total < length_m and town.connectors.get(lane.key):
-        options = town.connectors[lane.key]
+        options = town.connectors[lane.key]  # paths across the junction at the end of the lane
         connector = options[int(rng.integers(len(options)))]
         lane = connector.target
+        # The ends of a connector are points of the two lanes, and are not repeated.
         pieces += [connector.center[1:-1], lane.center]
         total += float(arc_lengths(connector.center)[-1]) + float(arc_lengths(lane.center)[-1])
     return resample(np.concatenate(pieces), spacing_m=1.5)
@@ -115,7 +122,7 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
 
     Args:
         town: The town.
-        scene: Number of the scene in its town.
+        scene: Number of the scene in its town, where further passes of a street are not counted.
         duration_s: Duration of the scene in seconds.
         rng: Random generator that chooses lane, speed, start and swing.
 
@@ -207,7 +214,14 @@ class Actor:
 
 
 def _random_vehicle(rng: np.random.Generator, identity: str, only_cars: bool = False) -> Vehicle:
-    """Create a vehicle of random kind, size and paint at the origin."""
+    """Create a vehicle of random kind, size and paint at the origin.
+
+    Args:
+        rng: Random generator of kind, size and paint.
+        identity: Name of the vehicle, unique in its scene. Names begin with m for moving vehicles,
+            with p for parked ones, and with w for people.
+        only_cars: Whether the kind is always a car.
+    """
     kind = CAR_KIND
     if not only_cars:
         kind = int(rng.choice(len(KINDS), p=[share for _, _, share in KINDS]))
@@ -238,7 +252,8 @@ def make_actors(town: Town, ego: Drive, duration_s: float, rng: np.random.Genera
     Returns:
         Moving vehicles, parked vehicles and people.
     """
-    times = np.linspace(0.0, duration_s, num=8).tolist()  # times at which gaps are checked
+    # Gaps are checked at these times only. Earlier candidates have priority over later ones.
+    times = np.linspace(0.0, duration_s, num=8).tolist()
     ego_track = np.array([ego.pose(t)[:2] for t in times])
     density = float(rng.uniform(low=0.25, high=1.0))
     candidates = [
@@ -266,7 +281,10 @@ def _least_distance(track: Array, other: Array) -> float:
 
 
 def _least_gaps(actor: Actor) -> tuple[float, float]:
-    """Smallest allowed distances in metres from an actor to the ego vehicle and to other actors."""
+    """Smallest allowed distances in metres from an actor to the ego vehicle and to other actors.
+
+    Distances are between centres.
+    """
     if actor.model.category.startswith("human"):
         return 2.5, 0.7
     half = actor.model.size[0] / 2  # half the length of the vehicle
@@ -296,7 +314,7 @@ def _moving_vehicles(
     for lane in town.lanes.values():
         if not _is_near(lane.center[::6], track):  # every sixth point is enough
             continue
-        arc_m = float(rng.uniform(low=0, high=40))
+        arc_m = float(rng.uniform(low=0, high=40))  # position of the next vehicle on the lane
         lane_m = float(arc_lengths(lane.center)[-1])
         # All vehicles of a lane are at rest, or they all drive at one speed, which keeps their
         # distances constant.
@@ -357,6 +375,8 @@ def _cars_on_shoulders(
             continue
         # Cars on the left shoulder of a road with opposite traffic face backwards.
         left_turn = np.pi if section.backward else 0.0
+        # Right side, then left side: offset of the parked cars (1.15 m inside of the kerb), width
+        # of the shoulder, and turn of the cars from the direction of the road.
         for offset, width, turn in (
             (section.right_m + 1.15, section.right_shoulder_m, 0.0),
             (section.left_m - 1.15, section.left_shoulder_m, left_turn),
@@ -399,6 +419,7 @@ def _people_spots(road: Road, rng: np.random.Generator) -> list[tuple[float, flo
     section = road.section
     spots = []
     for _ in range(int(road.length_m / 18)):
+        # 1.2 m beyond the kerb, on the pavement of one side or the other.
         offset = section.right_m - 1.2 if rng.random() < 0.5 else section.left_m + 1.2
         arc_m = float(rng.uniform(low=0, high=road.length_m))
         spots.append((arc_m, offset))

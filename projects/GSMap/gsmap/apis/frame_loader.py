@@ -38,6 +38,8 @@ class BrokenFrame:
 class FrameDataset(Dataset):
     """Frames of a test data set. A frame that cannot be loaded becomes a `BrokenFrame`.
 
+    A frame is loaded by the pipeline of the data set.
+
     Args:
         dataset: The data set. Its ``cameras`` are the names of the cameras that the model expects;
             without names, frames are loaded as they are.
@@ -66,21 +68,24 @@ class FrameDataset(Dataset):
             row: Index of the sample.
 
         Raises:
-            ValueError: If cameras are absent and ``blank_cameras`` is False, or if all cameras are
-                absent.
+            ValueError: If cameras are absent and ``blank_cameras`` is False, if all cameras are
+                absent, or if the pipeline refuses the sample.
+            OSError: If the pipeline cannot read a file.
         """
         cameras = self.dataset.cameras
         sample = self.dataset.sample(row)
         present = {camera.name for camera in sample.cameras}
         absent = [name for name in cameras or () if name not in present]
         if not cameras or not absent:
-            return self.dataset[row]
+            return self.dataset[row]  # applies the pipeline
         if not self.blank_cameras or len(absent) == len(cameras):
             raise InputError(
                 f"sample {sample.token!r} lacks the cameras {absent}, which the model expects; it "
                 f"has {sorted(present)}. With --allow-missing-cameras (allow_missing_cameras=True) "
                 "absent cameras are left blank if at least one camera is present."
             )
+        # The pipeline loads exactly the `cameras` of its data set. Only a shallow copy is changed,
+        # so that the data set itself keeps all cameras for the other frames.
         partial_dataset = copy.copy(self.dataset)
         partial_dataset.cameras = tuple(name for name in cameras if name in present)
         return _add_blank_cameras(partial_dataset[row], cameras=cameras)
@@ -93,7 +98,9 @@ def collate(items: Sequence[dict[str, Any] | BrokenFrame]) -> tuple[Any, list[Br
         items: Frames of a `FrameDataset`.
 
     Returns:
-        The batch of the usable frames, which is None without usable frames, and the broken frames.
+        The batch of the usable frames, as mmengine's ``pseudo_collate`` makes it (lists of inputs
+        and of samples, which are not stacked), and the broken frames. The batch is None if no frame
+        is usable.
     """
     broken: list[BrokenFrame] = []
     usable: list[dict[str, Any]] = []
@@ -110,7 +117,8 @@ def _add_blank_cameras(item: dict[str, Any], cameras: Sequence[str]) -> dict[str
     """Add black images for the absent cameras of a loaded sample.
 
     Args:
-        item: Inputs and data sample of the pipeline. Images have shape (V present, 3, H, W).
+        item: ``inputs`` and ``data_samples`` of the pipeline, for the present cameras. Images have
+            shape (V present, 3, H, W).
         cameras: Names of all cameras, in the order of the result.
 
     Returns:
@@ -122,16 +130,16 @@ def _add_blank_cameras(item: dict[str, Any], cameras: Sequence[str]) -> dict[str
     images = item["inputs"]["img"]
     intrinsics = meta["cam2img"][0]
     augmentation = meta["img_aug_matrix"][0]
-    # An absent camera has the intrinsics of the first camera, and a pose that is turned away from
-    # the map.
+    # An absent camera has the intrinsics and the augmentation of the first present camera, and a
+    # pose (`OUT_OF_SIGHT`) from which the whole map lies behind the camera.
     blank_matrices = {
         "cam2img": intrinsics,
         "img_aug_matrix": augmentation,
         "lidar2cam": OUT_OF_SIGHT,
         "lidar2img": augmentation @ intrinsics @ OUT_OF_SIGHT,
     }
-    position = {name: index for index, name in enumerate(meta["cam_names"])}
-    indices = list(map(position.get, cameras))  # None for an absent camera
+    index_of_name = {name: index for index, name in enumerate(meta["cam_names"])}
+    indices = list(map(index_of_name.get, cameras))  # None for an absent camera
     all_images: list[torch.Tensor] = []
     all_paths: list[Any] = []
     for index in indices:

@@ -17,8 +17,10 @@ from gsmap.structures.streams import Frame, MapStream, Scenes, StreamState
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
-METADATA_KEY = "gsmap"
-FORMAT = 1
+METADATA_KEY = "gsmap"  # key of the metadata, a JSON text, among the properties of the ONNX file
+FORMAT = 1  # version of the metadata; files of another version are refused
+# The next three texts are the values of the metadata's field ``can_bus``. They describe the vehicle
+# signals that the graph needs.
 CAN_BUS_RULE = (
     "the 18 values of a sample's record; the graph itself sets entries 0 to 2 and 17 to zero"
 )
@@ -27,10 +29,13 @@ POSE_ONLY_RULE = (
     "the vehicle, as the model was trained"
 )
 NO_SIGNALS = "not needed: the model was trained without vehicle signals; zeros are taken"
-STREAM_INPUTS = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
+# Inputs of a model with memory: the transform from the previous to the current frame, the seconds
+# between the frames, and 1 if the frame continues a stream, or 0 if it starts one.
+STREAM_INPUTS = ("now_from_then", "seconds", "continues")
 PRIOR_INPUT = "prior"  # input of models with a map prior: the part of an earlier map at the vehicle
 # Prefix of the inputs with the memory. The outputs with the new memory start with `new_memory_`.
 MEMORY_PREFIX = "memory_"
+# Types of numpy for the memory, by the names of ONNX Runtime.
 _PRECISIONS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _REQUIRED_OUTPUTS = {"scores", "labels", "points"}
 
@@ -72,7 +77,7 @@ class OnnxInferencer:
             raise FileNotFoundError(f"There is no ONNX file {path}; tools/export.py writes one.")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = num_threads
-        options.log_severity_level = 4  # errors are raised, so they need no log
+        options.log_severity_level = 4  # only fatal errors; other errors are raised, not logged
         try:
             self.session = onnxruntime.InferenceSession(
                 str(path), options, providers=list(providers)
@@ -115,11 +120,12 @@ class OnnxInferencer:
                 self._initial_memory[name] = np.zeros(graph_input.shape, dtype=dtype)
             elif name == PRIOR_INPUT:
                 self.prior_shape = tuple(graph_input.shape)
-            elif name not in STREAM_INPUTS:
+            elif name not in STREAM_INPUTS:  # any other input is an array of the calibration
                 self._calibration.append(name)
         if self.has_memory != bool(self._initial_memory):
             raise InputError("its graph and its metadata do not agree on a memory")
 
+    # A pickled stream recognises its model by this text (`Scenes.claim`).
     def __str__(self) -> str:
         return str(self.path)
 
@@ -144,7 +150,7 @@ class OnnxInferencer:
         Raises:
             ValueError: If the model has no memory.
         """
-        return Scenes(self.new_stream().max_gap_s)
+        return Scenes(self.new_stream().max_gap_s)  # `new_stream` checks that there is a memory
 
     def __call__(
         self,
@@ -157,18 +163,20 @@ class OnnxInferencer:
         Args:
             images: Images of ``cameras`` in their order: BGR as OpenCV reads them, values 0 to 255,
                 scaled to ``image_size``. (V, H, W, 3)
-            meta: Calibration of the sample.
+            meta: Calibration of the sample. In the names of its fields, ``lidar`` is the annotation
+                frame.
 
                 * All models read ``lidar2img`` (V, 4, 4): from metres in the annotation frame to
-                  (u * d, v * d, d, 1) in pixels of these images.
+                  (u * d, v * d, d, 1), with column u and row v of a pixel of these images, and
+                  depth d in metres.
                 * Camera-aware LSS encoders also read ``lidar2cam`` in metres, ``cam2img`` of the
                   original images in pixels, ``img_aug_matrix`` from the original to these images,
-                  (V, 4, 4) each, and ``lidar2ego`` (4, 4) in metres, by default the one of the
-                  training data.
+                  (V, 4, 4) each, and ``lidar2ego`` (4, 4) in metres, by default the transform of
+                  the training data.
                 * GKT and BEVFormer also read ``can_bus`` (18,) of a record, unless the model was
                   trained without vehicle signals.
-                * Models with a map prior also read ``prior``, the values of the cells in the range
-                  of the map, of ``prior_shape``, in [0, 1]; by default zeros.
+                * Models with a map prior also read ``prior``, values in [0, 1] of the cells in the
+                  range of the map. It has the shape ``prior_shape``; the default is zeros.
                 * Models with memory also read ``scene``, ``timestamp_ns`` and ``lidar2global``
                   (4, 4), from the annotation frame to the world in metres.
             stream: Memory of the drive of the sample, for a model with memory: a result of
@@ -179,9 +187,11 @@ class OnnxInferencer:
             The elements, best first, with scores and, if the model predicts them, Gaussians.
 
         Raises:
-            ValueError: If images or matrices do not fit the cameras, or a matrix is missing; for a
-                model with memory, if there is no stream, or the frame is not later than the last
-                frame of the stream.
+            ValueError: If images or matrices do not fit the cameras, or a matrix is missing. For a
+                model with memory, also if there is no stream, if the stream belongs to another
+                model, or if the frame is not later than the last frame of the stream. For a model
+                without memory, also if there is a stream. Also if the graph fails on the inputs, or
+                its outputs are not valid map elements.
         """
         outputs = self.run(self.prepare(images, meta=meta, stream=stream))
         elements = self.elements(outputs)
@@ -200,10 +210,11 @@ class OnnxInferencer:
         Args:
             images: Images of the cameras in uint8. (V, H, W, 3)
             meta: Calibration and pose of the frame, as in `__call__`.
-            stream: Drive of the frame, for a model with memory.
+            stream: Memory of the drive of the frame, for a model with memory. It is read, but not
+                advanced (`remember`).
 
         Returns:
-            The inputs by their names, in float32.
+            The inputs by their names. They are float32, except that a memory keeps its type.
 
         Raises:
             ValueError: If an input does not fit (see `__call__`).
@@ -212,6 +223,7 @@ class OnnxInferencer:
         self._check_signals(meta)
         if meta.get("lidar2ego") is None:
             meta = {**meta, "lidar2ego": self.metadata.get("ego_from_frame")}
+        # The arrays that the graph takes as inputs, computed from the matrices of `meta`.
         inputs = calibration_arrays(meta, names=self._calibration)
         for name, array in inputs.items():
             if name != "can_bus" and array.shape != (len(self.cameras), 4, 4):
@@ -229,7 +241,11 @@ class OnnxInferencer:
         return {"images": pixels, **inputs}
 
     def _read_window(self, meta: Mapping[str, Any]) -> NDArray[np.float32]:
-        """Window of the map prior in the metadata of a frame; zeros if there is none."""
+        """Window of the map prior in the metadata of a frame; zeros if there is none.
+
+        Raises:
+            ValueError: If the window has another shape or values outside of [0, 1].
+        """
         assert self.prior_shape is not None
         window = meta.get(PRIOR_INPUT)
         if window is None:
@@ -260,7 +276,11 @@ class OnnxInferencer:
 
         Args:
             meta: Pose and time of the frame, as in `__call__`.
-            stream: Drive of the frame.
+            stream: Memory of the drive of the frame.
+
+        Raises:
+            ValueError: If the model or the call has no memory, the stream belongs to another model,
+                or the frame is not later than the last frame of the stream.
         """
         if stream is None or not self.has_memory:
             self.new_stream()  # raises an error if the model has no memory
@@ -270,10 +290,10 @@ class OnnxInferencer:
             )
         stream.claim(self)  # raises an error if the stream belongs to another model
         frame = Frame.from_meta(meta)
-        (previous,) = stream.previous([frame])
+        (previous,) = stream.previous([frame])  # None for a frame that starts a stream
         continues = previous is not None
         if previous is None:
-            # For the first frame of a drive, the motion is the identity and 0 s have passed.
+            # The frame is its previous frame: the motion is the identity and 0 s have passed.
             previous = StreamState(frame, values=self._initial_memory)
         motion = frame.motion_from(previous.frame)  # (4, 4)
         seconds = frame.seconds_after(previous.frame)
@@ -290,9 +310,9 @@ class OnnxInferencer:
         """Advance a stream by one frame.
 
         Args:
-            stream: Drive of the frame.
+            stream: Memory of the drive of the frame; changed in place.
             meta: Pose and time of the frame, as in `__call__`.
-            outputs: Outputs of `run` for the frame.
+            outputs: Outputs of `run` for the frame, which include its memory.
         """
         memory = {name: outputs[f"new_{name}"] for name in self._initial_memory}
         stream.keep([StreamState(Frame.from_meta(meta), values=memory)])
@@ -320,7 +340,7 @@ class OnnxInferencer:
             inputs: Inputs of `prepare`.
 
         Returns:
-            The outputs by name, with the elements outside of the map.
+            The outputs by name. They include elements outside of the map, which `elements` removes.
 
         Raises:
             ValueError: If ONNX Runtime cannot run the graph on these inputs.
@@ -336,6 +356,8 @@ class OnnxInferencer:
 
     def elements(self, outputs: Mapping[str, NDArray[Any]]) -> MapElements:
         """Select the elements on or near the map whose scores are high enough.
+
+        ``margin_m`` and ``score_threshold`` of the metadata define both limits; None is no limit.
 
         Args:
             outputs: Outputs of `run`.
@@ -355,22 +377,24 @@ class OnnxInferencer:
         """Implementation of `elements`, which may raise errors of numpy."""
         margin = self.metadata["margin_m"]
         threshold = self.metadata["score_threshold"]
-        keep = np.ones(len(outputs["scores"]), dtype=bool)  # (M,)
+        is_selected = np.ones(len(outputs["scores"]), dtype=bool)  # (M,)
         if margin is not None:
-            # Corners (x, y) of the map. (2,) each
+            # All points of an element must lie within the margin around the map. `low` and `high`
+            # are the corners (x, y) of the map. (2,) each
             low, high = np.array([self.metadata["x_range"], self.metadata["y_range"]]).T
             points = outputs["points"][..., :2]  # (M, P, 2)
-            keep = ((points >= low - margin) & (points <= high + margin)).all((1, 2))
+            is_selected = ((points >= low - margin) & (points <= high + margin)).all((1, 2))
         if threshold is not None:
-            keep &= outputs["scores"] > threshold
+            is_selected &= outputs["scores"] > threshold
         fields: dict[str, NDArray[Any]] = {}
         for name, values in outputs.items():
             if not name.startswith(f"new_{MEMORY_PREFIX}"):
-                fields[name] = values[keep]
+                fields[name] = values[is_selected]
         if not np.isin(fields["labels"], range(len(self.classes))).all():
             raise InputError(f"a label is none of the {len(self.classes)} classes")
         self._unfold(fields)
         points = fields.pop("points")
+        # Number of valid points of each element; None if all elements have P points.
         counts = fields.pop("num_pts", None)
         if counts is None:
             return MapElements.from_polylines(points, **fields)
@@ -378,13 +402,16 @@ class OnnxInferencer:
         return MapElements.from_polylines(polylines, **fields)
 
     def _unfold(self, fields: dict[str, NDArray[Any]]) -> None:
-        """Reorder the points of each element of ``unfold_classes`` to a short line, in place."""
+        """Reorder the points of each element of ``unfold_classes`` to a short line, in place.
+
+        A predicted line of these classes may run back and forth.
+        """
         unfolded = np.isin(fields["labels"], self.metadata.get("unfold_classes", []))  # (M,)
         if not unfolded.any():
             return
         orders = shortest_orders(fields["points"][unfolded])  # (n, P)
         rows = np.arange(len(orders))[:, None]  # (n, 1)
-        for name in fields.keys() - {"scores", "labels", "num_pts"}:
+        for name in fields.keys() - {"scores", "labels", "num_pts"}:  # per point
             of_points = fields[name][unfolded]  # (n, P, ...)
             # Point j of line i is its former point ``orders[i, j]``.
             fields[name][unfolded] = of_points[rows, orders]
@@ -421,8 +448,10 @@ def _check_metadata(metadata: Mapping[str, Any]) -> None:
             raise InputError(f"{name} must be a number, got {metadata[name]!r:.80}")
     _check_poses(metadata)
     labels = metadata.get("unfold_classes", [])
+    # `type` instead of `isinstance`, because a bool is an instance of int.
     if not (isinstance(labels, list) and all(type(label) is int for label in labels)):
         raise InputError(f"unfold_classes must be class indices, got {labels!r:.80}")
+    # A model without memory has no `max_gap_s`. The default is any valid value.
     if not 0 < metadata.get("max_gap_s", 1.0) < np.inf:
         raise InputError(f"max_gap_s must be seconds > 0, got {metadata['max_gap_s']!r:.80}")
 

@@ -1,4 +1,7 @@
-"""Adaptation of checkpoints to models for other cameras, ranges, BEV cells and classes."""
+"""Adaptation of checkpoints to models for other cameras, ranges, BEV cells and classes.
+
+The cameras of a vehicle together are called a rig.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -36,8 +39,8 @@ AZIMUTHS_DEG = {
     "ring_rear_right": -153,
 }  # fmt: skip
 
-# Class embeddings of a generator of polylines. They are reordered only together with the class
-# weights of a detector.
+# Prefix of the class embeddings of a generator of polylines. They are reordered only together with
+# the class weights of a detector.
 _GENERATOR_LABELS = "map_head.generator.label."
 # Number of rows before the row of the first class, by the prefix of weights with a row per class.
 _CLASS_ROWS = {
@@ -71,7 +74,7 @@ def camera_rows(dataset: "VectorizedMapDataset", trained: Sequence[str]) -> list
     num_samples = min(len(dataset), _MAX_SAMPLES)
     samples = map(dataset.sample, range(num_samples))
     fullest_sample = max(samples, key=lambda sample: len(sample.cameras))
-    frame = dataset.metainfo["frame"]
+    frame = dataset.metainfo["frame"]  # "lidar" or "ego", the annotation frame
     return similar_cameras(fullest_sample, frame=frame, names=names, trained=trained)
 
 
@@ -146,6 +149,7 @@ def fit_start(
         "frame": "training must learn which axis points ahead, unless samples are in the old frame",
     }
     for name, note in notes.items():
+        # `plain` turns tuples into lists, so that equal ranges compare as equal.
         if name in origin and plain(origin[name]) != plain(metainfo[name]):
             lines.append(f"{name} was {origin[name]}, is {metainfo[name]}: {note}.")
     return lines
@@ -174,7 +178,7 @@ def _fit_cameras(
     embeds = state[key]  # (V_old, C)
     num_cameras = len(initial[key])
     if trained is None or len(trained) != len(embeds):
-        if len(embeds) == num_cameras:
+        if len(embeds) == num_cameras:  # assume that the cameras are equal
             return []
         trained = ()  # no known names
     names = _camera_names(dataset)
@@ -204,21 +208,22 @@ def _fit_cells(state: dict[str, Tensor], initial: Mapping[str, Tensor]) -> list[
     Returns:
         A line about the change, if there is one.
     """
-    cells = "bev_encoder.bev_embedding.weight"
-    rows = "bev_encoder.positional_encoding.row_embed.weight"
-    columns = "bev_encoder.positional_encoding.col_embed.weight"
-    if not {cells, rows, columns} <= state.keys() & initial.keys():
+    cells_key = "bev_encoder.bev_embedding.weight"  # one query per cell, row by row
+    rows_key = "bev_encoder.positional_encoding.row_embed.weight"
+    columns_key = "bev_encoder.positional_encoding.col_embed.weight"
+    common_keys = state.keys() & initial.keys()
+    if not {cells_key, rows_key, columns_key} <= common_keys:
         return []
-    old_size = [len(state[rows]), len(state[columns])]
-    new_size = [len(initial[rows]), len(initial[columns])]
-    if old_size == new_size or len(state[cells]) != old_size[0] * old_size[1]:
+    old_size = [len(state[rows_key]), len(state[columns_key])]
+    new_size = [len(initial[rows_key]), len(initial[columns_key])]
+    if old_size == new_size or len(state[cells_key]) != old_size[0] * old_size[1]:
         return []
-    image = state[cells].float().unflatten(0, old_size).permute(2, 0, 1)[None]  # (1, C, H, W)
+    image = state[cells_key].float().unflatten(0, old_size).permute(2, 0, 1)[None]  # (1, C, H, W)
     image = interpolate(image, new_size, mode="bilinear")
-    state[cells] = image[0].permute(1, 2, 0).flatten(0, 1)  # (H * W, C)
-    for side, count in zip((rows, columns), new_size, strict=True):
-        line = state[side].float().T[None]  # (1, C, H or W)
-        state[side] = interpolate(line, count, mode="linear")[0].T  # (H or W, C)
+    state[cells_key] = image[0].permute(1, 2, 0).flatten(0, 1)  # (H * W, C)
+    for key, count in zip((rows_key, columns_key), new_size, strict=True):
+        encodings = state[key].float().T[None]  # (1, C, H or W)
+        state[key] = interpolate(encodings, count, mode="linear")[0].T  # (H or W, C)
     old_text = f"{old_size[0]} x {old_size[1]}"
     return [f"queries of {old_text} BEV cells interpolated to {new_size[0]} x {new_size[1]}."]
 
@@ -228,7 +233,8 @@ def _fit_queries(
 ) -> list[str]:
     """Append queries from the initial weights if the checkpoint has fewer than the model.
 
-    Only models with one group of queries are changed.
+    Only models with one group of queries are changed. With several groups, appended queries would
+    not belong to the first group, the only one that predicts.
 
     Args:
         state: Weights of the checkpoint; changed in place.
@@ -340,19 +346,20 @@ class RigFitHook(Hook):
             runner: Runner of the training.
             checkpoint: Contents of the checkpoint; changed in place.
         """
-        # In a test, no training loop is built.
+        # In a test, no training loop is built: the attribute is still a config, or None.
         if runner._resume or isinstance(runner._train_loop, dict | None):
             return
-        dataset = innermost(runner.train_dataloader.dataset)
+        dataset = innermost(runner.train_dataloader.dataset)  # without wrappers
         state = checkpoint.get("state_dict", checkpoint)
+        # A model for several GPUs is wrapped. Its wrapper adds the prefix "module." to all keys.
         weights = {key.removeprefix("module."): value for key, value in state.items()}
-        if is_upstream(weights):
+        if is_upstream(weights):  # keys of the code of the model's authors
             weights = ours_from_upstream(weights)
         model = getattr(runner.model, "module", runner.model)
         origin = _training_facts(runner._load_from, checkpoint=checkpoint)
         for line in fit_start(weights, model=model, dataset=dataset, origin=origin):
             print_log(f"{runner._load_from}: {line}", logger="current")
-        state.clear()
+        state.clear()  # the runner loads this dictionary, so it is changed in place
         state.update(weights)
 
 
@@ -365,6 +372,9 @@ def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         path: File of the checkpoint.
         checkpoint: Contents of the file.
+
+    Returns:
+        The known facts among ``cameras``, ``classes``, ``frame``, ``x_range`` and ``y_range``.
     """
     metadata: Any = (checkpoint.get("meta") or {}).get("dataset_meta") or {}
     for model in named_models().values():

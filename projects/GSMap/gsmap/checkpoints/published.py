@@ -33,17 +33,20 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write, file_name
 from gsmap.utils.shards import digest
 
-WEIGHTS = "GSMAP_WEIGHTS"
+WEIGHTS = "GSMAP_WEIGHTS"  # environment variable with a folder of weights
 SILENCE_S = 30.0  # longest time without a byte from the server
 HEADER_S = 60.0  # longest time until the header is complete
 LIMIT_S = 3600.0  # longest time of a download
 _BLOCK_BYTES = 1 << 20
-_DIGEST = re.compile(r"-([0-9a-f]{8,64})(\.\w+)?\Z")  # in file names of torch and OpenMMLab
+# First digits of the sha256 at the end of a file name, as torch and OpenMMLab publish files.
+_DIGEST = re.compile(r"-([0-9a-f]{8,64})(\.\w+)?\Z")
+# `to_ours` of the map returns the key of mmdet's backbone, or None for weights of the classifier.
 _EFFICIENTNET = KeyMap(
     name="efficientnet",
     rules=efficientnet_rules(theirs="", ours=""),
     unused=unused_classifier(theirs=""),
 )
+# A key with the prefix identifies a format. The first group of the pattern is the key of mmdet.
 _DETECTRON_PREFIX = "backbone.bottom_up."
 _DETECTRON = re.compile(re.escape(_DETECTRON_PREFIX) + "(.+)")
 _SWIN_PREFIX = "backbone.layers.0.blocks.0.attn."
@@ -55,10 +58,12 @@ def load_published(
 ) -> Any:
     """Load weights by their address; a replacement for mmengine's ``load_url``.
 
+    The parameters are the parameters of ``load_url``.
+
     Args:
         address: Address of the published file.
         model_dir: Ignored; `find_weights` determines the folder.
-        map_location: Device, as torch takes it.
+        map_location: Device, as ``torch.load`` takes it.
         progress: Ignored.
 
     Returns:
@@ -70,10 +75,10 @@ def load_published(
     """
     path = find_weights(address)
     try:
-        with refusing(address):  # raises ValueError for a damaged file
+        with refusing(address):  # raises ValueError for a damaged file, with a remedy
             checkpoint = load_tensors(path, map_location=map_location)
     except ValueError as error:
-        if path != cache_file(address):
+        if path != cache_file(address):  # a file of the user is never removed
             raise InputError(f"{error} The file is {path}.") from error
         path.unlink(missing_ok=True)
         raise InputError(f"{error} The fetched file, {path}, was removed.") from error
@@ -85,7 +90,7 @@ def load_from_file(path: str, map_location: Any = "cpu") -> Any:
 
     Args:
         path: Path of the file; ``~`` is expanded.
-        map_location: Device, as torch takes it.
+        map_location: Device, as ``torch.load`` takes it.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -102,12 +107,14 @@ def load_from_torchvision(name: str, map_location: Any = "cpu") -> Any:
     """Load the weights of ``torchvision://NAME`` without torchvision; a loader for mmengine.
 
     Args:
-        name: Name of the weights with its scheme, ``torchvision://NAME``.
-        map_location: Device, as torch takes it.
+        name: Name of the weights with its scheme, ``torchvision://NAME`` or ``modelzoo://NAME``.
+        map_location: Device, as ``torch.load`` takes it.
 
     Raises:
-        ValueError: If torchvision has no weights of this name.
+        OSError: If the file is not available and cannot be downloaded.
+        ValueError: If torchvision has no weights of this name, or the file cannot be read.
     """
+    # mmengine comes with a table of the addresses of torchvision's weights, by their names.
     table = Path(mmengine.__file__).parent / "hub/torchvision_0.12.json"
     addresses = json.loads(table.read_text())
     address = addresses.get(name.partition("://")[2])
@@ -127,7 +134,8 @@ def find_weights(address: str) -> Path:
         address: Address of the published file.
 
     Raises:
-        OSError: If the file is not available and cannot be downloaded.
+        OSError: If the file is not available and cannot be downloaded, or if ``GSMAP_WEIGHTS`` does
+            not name a folder.
     """
     name = _published_name(address)
     folder = os.environ.get(WEIGHTS)
@@ -189,17 +197,23 @@ def _download(address: str, path: Path) -> None:
             file.write(block)
         published_digest = _DIGEST.search(_published_name(address))
         if published_digest and not sha256.hexdigest().startswith(published_digest[1]):
+            # The exception leaves the block of `atomic_write`, so no file is created.
             reason = f"it came with sha256 {sha256.hexdigest()[:16]}..."
             raise _download_error(address, reason=reason)
 
 
 def _read_blocks(address: str) -> Iterator[bytes]:
-    """Download a file in blocks, for at most `LIMIT_S`."""
+    """Download a file in blocks, for at most `LIMIT_S`.
+
+    Raises:
+        OSError: If the download fails, is too slow or is incomplete.
+    """
     end_s = time.monotonic() + LIMIT_S
     try:
         with _open_address(address) as response:
             length = response.headers.get("Content-Length")
             received = 0
+            # `read1` returns as soon as some bytes arrive, so that the time is checked often.
             while block := response.read1(_BLOCK_BYTES):
                 received += len(block)
                 if time.monotonic() > end_s:
@@ -208,6 +222,7 @@ def _read_blocks(address: str) -> Iterator[bytes]:
             if length is not None and received != int(length):
                 raise ConnectionError(f"cut after {received} of {length} bytes")
     except (OSError, http.client.HTTPException, ValueError) as error:
+        # A ValueError means a malformed address or length. A URLError has its cause in `reason`.
         reason = str(getattr(error, "reason", None) or error)
         raise _download_error(address, reason=reason) from error
 
@@ -277,7 +292,7 @@ def in_our_names(checkpoint: Any) -> Any:
             if name is not None:
                 renamed[name] = value
         return renamed
-    keys = list(map(str, state))
+    keys = list(map(str, state))  # a foreign file may have keys that are not strings
     if any(key.startswith(_DETECTRON_PREFIX) for key in keys):
         return _select_weights(state, pattern=_DETECTRON)
     if any(key.startswith(_SWIN_PREFIX) for key in keys):

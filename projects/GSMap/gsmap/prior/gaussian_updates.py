@@ -1,4 +1,8 @@
-"""Measurements of stored Gaussians by the lines of a frame, and their Kalman update."""
+"""Measurements of stored Gaussians by the lines of a frame, and their Kalman update.
+
+The Gaussians of a prior lie along the lines of its map. A predicted line of a new frame measures
+how far a Gaussian is from it.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,7 +20,8 @@ from gsmap.structures.polylines import arc_lengths
 
 REACH_M = 1.5
 """Largest distance in metres of a line from a Gaussian that it measures, as in ``build_map``."""
-_LEAST_COSINE = np.cos(np.radians(30.0))  # between a Gaussian and a line that measures it
+# Smallest cosine between the directions of a Gaussian and of a line that measures it.
+_LEAST_COSINE = np.cos(np.radians(30.0))
 _SIGMA_PER_M = 0.02  # standard deviation per metre of distance from the vehicle
 # No Gaussian is added nearer to another one, along a line, than this share of the spacing.
 _COVERED = 0.75
@@ -74,8 +79,12 @@ def sample_lines(
         label: Index of the class.
         pose: Position and yaw of the frame.
         rule: Distance of the points, and variance of predictions without Gaussians.
+
+    Returns:
+        Points and segments of all lines of the class. A line without length is left out.
     """
     chosen = elements.select(elements.labels == label).with_coordinates(2)
+    # Each list starts with an empty array, so that it can be concatenated without any line.
     points = [np.zeros((0, 2))]
     variances = [np.zeros(0)]
     scores = [np.zeros(0)]
@@ -84,6 +93,7 @@ def sample_lines(
     num_points = 0
     vertex_variances = _vertex_variances(chosen, rule)
     for index, (line, _, score) in enumerate(chosen.rows):
+        # Distance from the first vertex to each vertex along the line.
         along = arc_lengths(line) if len(line) > 1 else np.zeros(1)
         if along[-1] <= 0.0:  # a line without length has no direction
             continue
@@ -138,21 +148,24 @@ def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measur
         means: Centres of the Gaussians in metres. (N, 2)
         angles: Directions of their lines in radians. (N,)
         lines: Lines of the frame.
+
+    Returns:
+        A measurement for each Gaussian. Without a line, its variance is 1 and has no meaning.
     """
     count = len(means)
-    found = Measurements(
+    measurements = Measurements(
         is_found=np.zeros(count, dtype=np.bool_),
         distances=np.zeros(count),
-        variances=np.ones(count),
+        variances=np.ones(count),  # not 0, because `fuse_across` divides by them
         turns=np.zeros(count),
         scores=np.zeros(count),
     )
     if not count or not len(lines.starts):
-        return found
+        return measurements
     start_points = lines.points[lines.starts]
     end_points = lines.points[lines.starts + 1]
     lengths = np.linalg.norm(end_points - start_points, axis=1)
-    # A segment that crosses a normal within reach has its middle within this radius.
+    # If a segment crosses a normal within reach, its middle is within this radius of the Gaussian.
     radius_m = REACH_M + lengths.max() / 2 + _ROUNDING_M
     rows, segments = _near_pairs(means, (start_points + end_points) / 2, radius_m=radius_m)
     # Ends of each segment, along and across the Gaussian of its pair.
@@ -165,10 +178,12 @@ def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measur
     # that is parallel to the normal has extent 0, and its share is 0.
     fraction = -start_along / np.where(extent == 0, np.inf, extent)
     distances = start_across + fraction * rise
+    # The ends of the segment lie on different sides of the normal, or on it.
     begins_before = np.minimum(start_along, end_along) <= _ROUNDING_M
     ends_behind = np.maximum(start_along, end_along) >= -_ROUNDING_M
     crosses = begins_before & ends_behind
     is_match = crosses & (np.abs(distances) <= REACH_M) & (lengths[segments] > 0)
+    # The extent of a segment is its length times the cosine of its angle to the Gaussian.
     is_match &= np.abs(extent) >= _LEAST_COSINE * lengths[segments]
     matches = np.flatnonzero(is_match)
     # Sort by Gaussian, distance and segment, so that the first match of a Gaussian is its best one.
@@ -179,24 +194,28 @@ def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measur
     start_indices = lines.starts[segments[best]]  # of the points at which the best segments start
     start_variances = lines.variances[start_indices]
     end_variances = lines.variances[start_indices + 1]
-    found.is_found[index] = True
-    found.distances[index] = distances[best]
-    found.turns[index] = np.arctan(rise[best] / extent[best])
-    found.scores[index] = lines.scores[start_indices]
-    found.variances[index] = start_variances + fraction[best] * (end_variances - start_variances)
-    return found
+    best_variances = start_variances + fraction[best] * (end_variances - start_variances)
+    measurements.is_found[index] = True
+    measurements.distances[index] = distances[best]
+    measurements.turns[index] = np.arctan(rise[best] / extent[best])
+    measurements.scores[index] = lines.scores[start_indices]
+    measurements.variances[index] = best_variances
+    return measurements
 
 
 def _near_pairs(
     first: FloatArray, second: FloatArray, radius_m: float
 ) -> tuple[IntArray, IntArray]:
-    """Find the pairs of points within a radius; return the indices of both. (N, 2), (M, 2)"""
+    """Find the pairs of points within a radius, and return the indices of both points of each pair.
+
+    Points (N, 2) and (M, 2) -> indices (pairs,) and (pairs,)
+    """
     pairs = cKDTree(first).sparse_distance_matrix(cKDTree(second), radius_m, output_type="ndarray")
     return pairs["i"], pairs["j"]
 
 
 def _offsets(points: FloatArray, means: FloatArray, angles: FloatArray) -> FloatArray:
-    """Coordinates of points (n, 2) along and across Gaussians, in metres. -> (n, 2)"""
+    """Coordinates of each point along and across the Gaussian of equal index, in metres. (n, 2)"""
     x, y = (points - means).T
     cos = np.cos(angles)
     sin = np.sin(angles)
@@ -207,6 +226,8 @@ def find_covered_points(
     means: FloatArray, angles: FloatArray, lines: LineSamples, spacing_m: float
 ) -> NDArray[np.bool_]:
     """Find the points of lines that a Gaussian already describes.
+
+    New Gaussians are only added at the other points.
 
     Args:
         means: Centres of the Gaussians in metres. (N, 2)
@@ -244,16 +265,16 @@ def fuse_across(
     measurement does not change.
 
     Args:
-        variances: Variances across the lines, in square metres. (N,)
-        found: Measurements.
-        decay: Factor of the older information.
-        least_variance: Smallest variance in square metres.
+        variances: Variances of the Gaussians across their lines, in square metres. (N,)
+        found: Measurement of each Gaussian.
+        decay: Factor of the older information, in (0, 1].
+        least_variance: Smallest new variance in square metres.
 
     Returns:
         New variances in square metres (N,), and gains in [0, 1], 0 without a measurement (N,).
     """
     stored_information = decay / variances
-    measured_information = found.is_found / found.variances
+    measured_information = found.is_found / found.variances  # 0 without a measurement
     fused_variances = 1.0 / (stored_information + measured_information)
     gains = fused_variances * measured_information
     limited_variances = np.maximum(fused_variances, least_variance)

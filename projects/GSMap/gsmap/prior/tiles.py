@@ -28,9 +28,10 @@ _WASTED_BYTES = 64 << 20
 class TileStore:
     """Tiles by their column and row in the global frame (`TileKey`), with a memory limit.
 
-    A tile is an array of cell states, whose meaning the rule of the prior defines. When the limit
-    is reached, the least recently used tile leaves memory. If it has changed since it was read, it
-    is compressed and written to a temporary file.
+    A tile is an array with the states of its cells. The rule of the prior defines the meaning of a
+    state, one byte. When the limit is reached, the least recently used tile leaves memory. If it
+    has changed since it was read, it is compressed and written to a temporary file. The store
+    never writes to the file of the prior.
 
     Args:
         shape: Shape of a tile.
@@ -41,12 +42,12 @@ class TileStore:
         self.shape = shape
         self._tile_bytes = int(np.prod(shape))
         self._most_tiles = max(1, memory_bytes // self._tile_bytes)
-        self._tiles: OrderedDict[TileKey, Tile] = OrderedDict()
-        self._changed: set[TileKey] = set()
+        self._tiles: OrderedDict[TileKey, Tile] = OrderedDict()  # the least recently used one first
+        self._changed: set[TileKey] = set()  # tiles in memory that differ from both files
         self._file_entries: dict[TileKey, TileEntry] = {}
         self._mapped: mmap.mmap | None = None
         self._path = Path()
-        self._mapped_bytes = 0
+        self._mapped_bytes = 0  # read from the file since its pages were last released
         self._spill = _SpillFile()
 
     def open(self, mapped: mmap.mmap, path: Path, entries: dict[TileKey, TileEntry]) -> None:
@@ -56,7 +57,7 @@ class TileStore:
         of its tiles in their current state.
 
         Args:
-            mapped: Content of the file.
+            mapped: Content of the file. The store closes it in `close`, or in the next `open`.
             path: Name of the file, for messages.
             entries: Offset, length and checksum of each tile in the file.
         """
@@ -82,6 +83,10 @@ class TileStore:
 
         The caller must not keep the tile: if it leaves memory, it is read again as a new array, and
         later changes go to this array.
+
+        Raises:
+            ValueError: If the tile is damaged in its file.
+            RuntimeError: If the temporary file is needed, but belongs to another process.
         """
         tile = self._tiles.get(key)
         if tile is None:
@@ -96,6 +101,10 @@ class TileStore:
         """Return a tile for the caller to change before the next call.
 
         A tile that does not exist yet is created, with ``empty`` everywhere.
+
+        Raises:
+            ValueError: If the tile is damaged in its file.
+            RuntimeError: If the temporary file is needed, but belongs to another process.
         """
         tile = self.get(key)
         if tile is None:
@@ -105,7 +114,14 @@ class TileStore:
         return tile
 
     def packed_tiles(self) -> Iterator[tuple[TileKey, bytes]]:
-        """Iterate over all tiles, compressed, in the order of their columns, then rows."""
+        """Iterate over all tiles, compressed, in the order of their columns, then rows.
+
+        Tiles that are not in memory are not loaded into it.
+
+        Raises:
+            ValueError: If a tile is damaged in its file.
+            RuntimeError: If a tile is in the temporary file of another process.
+        """
         for key in sorted(self.keys()):
             yield key, self._packed(key)
 
@@ -136,17 +152,19 @@ class TileStore:
         offset, length, crc = self._file_entries[key]
         content = self._mapped[offset : offset + length]
         self._mapped_bytes += length
+        # Some systems cannot release the pages of a mapped file.
         if self._mapped_bytes > _MAPPED_BYTES and hasattr(mmap, "MADV_DONTNEED"):
             self._mapped.madvise(mmap.MADV_DONTNEED)
             self._mapped_bytes = 0
         return content, crc
 
     def _load(self, key: TileKey) -> Tile | None:
-        """Read a tile that is not in memory."""
+        """Read a tile that is not in memory. None if no file has it."""
         if key not in self._spill.entries and key not in self._file_entries:
             return None
         content, crc = self._stored(key)
         states = unpack_tile(content, crc=crc, num_bytes=self._tile_bytes, path=self._path)
+        # `states` is a bytearray, so the array can be written to.
         return np.frombuffer(states, dtype=np.uint8).reshape(self.shape)
 
     def _keep(self, key: TileKey, tile: Tile) -> None:
@@ -172,7 +190,10 @@ class _SpillFile:
         self._process = os.getpid()
 
     def write(self, key: TileKey, content: bytes) -> None:
-        """Write a tile, which replaces an earlier version of the tile."""
+        """Write a tile, which replaces an earlier version of the tile.
+
+        The earlier version stays in the file until `_compact` removes all replaced versions.
+        """
         self._require_process()
         replaced_bytes = self._end - self._used_bytes
         if replaced_bytes > max(_WASTED_BYTES, self._used_bytes):
@@ -183,7 +204,7 @@ class _SpillFile:
         self._append(key, content)
 
     def read(self, key: TileKey) -> tuple[bytes, int]:
-        """Return a tile and its checksum."""
+        """Return a compressed tile and its checksum."""
         self._require_process()
         offset, length, crc = self.entries[key]
         assert self._file is not None

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import gsmap
 
-_MARKER = "models/registry.json"
+_MARKER = "models/registry.json"  # a root that has this file has all installed files
 
 
 def shipped_path(path: str = "") -> Path:
@@ -13,12 +13,16 @@ def shipped_path(path: str = "") -> Path:
     A wheel installs these files to ``gsmap/.mim``; an editable installation uses the repository.
 
     Args:
-        path: Path of the file or folder in the repository.
+        path: Path of the file or folder in the repository; the default is the root of all files.
+
+    Returns:
+        The path, which is not checked: the file or folder may be missing.
 
     Raises:
         FileNotFoundError: If the installation is incomplete.
     """
     package = Path(gsmap.__file__).parent
+    # In an editable installation, the repository is one of the folders above the package.
     for root in (package / ".mim", *package.parents):
         if (root / _MARKER).is_file():
             return root / path

@@ -1,4 +1,7 @@
-"""Bird's-eye-view panels with a metric grid, the ego vehicle and map elements; ahead is up."""
+"""Bird's-eye-view panels with a metric grid, the ego vehicle and map elements; ahead is up.
+
+Coordinates in the display are metres to the right and metres ahead of the vehicle.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,8 +52,8 @@ class BEVPanel:
         points: Points in metres in the annotation frame, such as a LiDAR sweep, drawn as faint
             dots. (n, >= 2)
         truth: Ground truth, drawn in broad lines under the elements and coloured by its matches.
-        hits: Index of the ground truth matched with each element, or -1. Elements have the colours
-            of matches instead of classes. (N,)
+        hits: Index of the ground truth matched with each element, or -1 for a false prediction. The
+            elements then have the colours of matches instead of classes. None without matches. (N,)
         colours: Colour of each element, instead of the colour of its class. (N,)
     """
 
@@ -74,7 +77,7 @@ class BEVPanel:
 
         Returns:
             Two lists: ``hit`` or ``false`` for each element (N,), empty if ``hits`` is None; and
-            ``found`` or ``missed`` for each ground truth (K,).
+            ``found`` or ``missed`` for each ground truth (K,), empty if ``truth`` is None.
         """
         hits: Sequence[int] = () if self.hits is None else self.hits.tolist()
         outcomes = ["hit" if hit >= 0 else "false" for hit in hits]
@@ -102,7 +105,10 @@ def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float,
 
 
 def _ticks(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Multiples of 10 m (5 m on a small map) between two bounds in metres, and their labels."""
+    """Multiples of 10 m (5 m on a small map) between two bounds in metres, and their labels.
+
+    The last label also has the unit.
+    """
     step = 10 if high - low > 20 else 5
     positions = np.arange(np.ceil(low / step) * step, high + 1e-6, step)
     labels = [f"{position:g}".replace("-", "\N{MINUS SIGN}") for position in positions]
@@ -131,6 +137,7 @@ def _draw_background(
 
 def _draw_vehicle(ax: Axes, view: FrameView) -> None:
     """Draw the ego vehicle to scale, with its windscreen towards the road ahead."""
+    # The display has the vehicle around x = 0, from y = rear to y = front.
     rear, front, width = view.vehicle_m
     length = front - rear
     half_width = width / 2
@@ -179,7 +186,7 @@ def draw_lines(
         outcomes: ``hit`` or ``false`` for each polyline (N,); empty for no dashed lines.
     """
     shapes = []
-    faces = []
+    faces = []  # colours of the areas
     for line, label, colour in zip(lines, labels, colours, strict=True):
         if style.is_closed(label):
             shapes.append(line)
@@ -248,7 +255,7 @@ def _draw_scores(
     low = np.array([left, bottom])
     high = np.array([right, top])
     rear, front, width = view.vehicle_m
-    font_px = _SCORE_PT / 72 * ax.figure.dpi
+    font_px = _SCORE_PT / 72 * ax.figure.dpi  # a point is 1/72 inch
     font_m = font_px * (top - bottom) / ax.get_window_extent().height
     half_size = font_m * np.array([1.4, 0.6])  # half width and height of a text such as 0.87
     vehicle_centre = np.array([0, (rear + front) / 2])
@@ -256,10 +263,11 @@ def _draw_scores(
     obstacles = [vehicle_centre]
     # A text is clear of an obstacle if their centres are farther apart than this along x or y.
     clearances = [half_size + vehicle_size / 2]
-    for index in np.argsort(-scores, kind="stable"):
+    for index in np.argsort(-scores, kind="stable"):  # the most confident element first
         line = lines[index]
         from_middle = np.abs(np.arange(len(line)) - len(line) // 2)
         candidates = line[np.argsort(from_middle, kind="stable")]
+        # Each text is centred on its vertex, so it needs half of its size on every side.
         is_inside = (candidates > low + half_size) & (candidates < high - half_size)
         distances = np.abs(candidates[:, None] - obstacles)  # (P, obstacles, 2)
         clears_obstacle = (distances > clearances).any(axis=2)  # (P, obstacles)
@@ -269,7 +277,7 @@ def _draw_scores(
             continue
         position = candidates[is_free.argmax()]
         obstacles.append(position)
-        clearances.append(2 * half_size)
+        clearances.append(2 * half_size)  # half of each of two texts
         x, y = position
         text = ax.text(x, y, f"{scores[index]:.2f}", ha="center", va="center", zorder=20)
         darker_colour = 0.62 * np.array(mcolors.to_rgb(colours[index]))
@@ -304,6 +312,7 @@ def _draw_rasters(ax: Axes, picture: np.ndarray, view: FrameView) -> None:
         # The rows of the picture run along y (left), and its columns along x (ahead). The display
         # has x upwards and -y to the right, so the axes are swapped and the columns reversed.
         picture = picture.transpose(1, 0, 2)[:, ::-1]
+    # `_draw_background` has set the limits of the axes to the extent of the map, as in the rasters.
     extent = (*ax.get_xlim(), *ax.get_ylim())
     ax.imshow(picture, origin="lower", extent=extent, interpolation="bilinear", zorder=1)
     ax.grid(False)
@@ -311,7 +320,7 @@ def _draw_rasters(ax: Axes, picture: np.ndarray, view: FrameView) -> None:
 
 def _draw_truth(ax: Axes, panel: BEVPanel, view: FrameView, style: MapStyle) -> None:
     """Draw the ground truth in broad lines, coloured by its matches."""
-    if not panel.truth:
+    if not panel.truth:  # None, or no elements
         return
     _, outcomes = panel.outcomes
     colours = []
@@ -351,7 +360,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5)
     _draw_vehicle(ax, view)
     _draw_truth(ax, panel, view=view, style=style)
-    if not elements:
+    if not elements:  # None, or no elements
         note = ax.text(0.5, 0.03, panel.note, transform=ax.transAxes, ha="center", va="bottom")
         note.set(fontsize=7, color=style.muted)
         return

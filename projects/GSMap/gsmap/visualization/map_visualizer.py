@@ -27,7 +27,7 @@ from gsmap.visualization.style import MapStyle
 PANELS = ("ground_truth", "prediction", "matches", "gaussians", "rasters")
 """Names of the bird's-eye views, in their order in a picture."""
 RASTER_SIZE = (400, 200)
-"""Rows and columns of rendered masks."""
+"""Rows and columns of the rendered masks in the view ``rasters``."""
 
 
 def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
@@ -61,7 +61,7 @@ def ground_truth_elements(data_sample: Any) -> MapElements | None:
     info = data_sample.metainfo.get("eval_ann_info")
     if info is not None:
         return elements_of_truth(info)
-    instances = getattr(data_sample, "gt_instances_3d", ())
+    instances = getattr(data_sample, "gt_instances_3d", ())  # an empty tuple has no "pts"
     return elements_of_targets(instances) if "pts" in instances else None
 
 
@@ -95,7 +95,8 @@ class MapVisualizer(Visualizer):
             ground follows from the mounting of the sensor (``lidar2ego`` of the sample), or else
             from the height in the annotation file, or from the usual height of the frame.
         score_thr: Smallest score of a drawn prediction, in [0, 1].
-        panels: Bird's-eye views to draw, from `PANELS`. Views without data are left out.
+        panels: Bird's-eye views to draw, from `PANELS`; by default all but ``rasters``. Views
+            without data are left out.
         match_m: Largest Chamfer distance of a hit in ``matches``, in metres, as in AP_chamfer.
         show_order: Whether to mark the start and the direction of elements.
         width_px: Width of the picture in pixels.
@@ -198,12 +199,16 @@ class MapVisualizer(Visualizer):
         if images is not None:
             pictures += images
         else:
+            # The files show the original images, but `lidar2img` includes the augmentation.
             if metainfo.get("img_aug_matrix") is not None:
                 augmentation = np.asarray(metainfo["img_aug_matrix"], np.float64)
                 projections = np.linalg.inv(augmentation) @ projections
             where = f"sample {metainfo.get('token')!r}"
             for path in paths or ():
-                pictures.append(None if path is None else read_image(path, where)[..., ::-1])
+                if path is None:
+                    pictures.append(None)
+                else:
+                    pictures.append(read_image(path, where)[..., ::-1])  # BGR -> RGB
         if len(pictures) != len(projections):
             raise InputError(
                 f"A sample has {len(pictures)} images, but {len(projections)} projections."
@@ -226,10 +231,10 @@ class MapVisualizer(Visualizer):
         Args:
             truth: Ground truth, if it is known.
             predictions: Predictions, if there are any.
-            points: LiDAR points in metres, drawn as faint dots. (n, >= 2)
+            points: LiDAR points in metres in the annotation frame, drawn as faint dots. (n, >= 2)
             note: Text of panels without predictions.
         """
-        panels = {}
+        panels = {}  # by name, in the order of `PANELS`
         if truth is not None:
             panels["ground_truth"] = BEVPanel(
                 "Ground truth", truth, order=self.show_order, points=points
@@ -265,11 +270,13 @@ class MapVisualizer(Visualizer):
         config = ChamferConfig(tuple(self.style.classes), (self.match_m,))
         matches = match_chamfer(predictions, truth, config)
         hits = np.full(len(predictions), -1)
+        # The matches are sorted and may lack predictions. `pred_index` has their original indices.
         hits[matches.pred_index] = matches.matched_gt[:, 0]  # at the only threshold
         return hits
 
     def _render_masks(self, elements: MapElements) -> np.ndarray:
         """Render the Gaussians of each element to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
+        # Elements with Gaussians all have P points, so that their flat arrays can be split evenly.
         tensors = []
         for values in (elements.points[:, :2], elements.scales, elements.rotations):
             flat = torch.as_tensor(values, dtype=torch.float32)  # (N * P, 2) or (N * P,)
@@ -300,14 +307,15 @@ class MapVisualizer(Visualizer):
             Figure, not rendered yet.
 
         Raises:
-            ValueError: If the sample has neither images nor a map.
+            ValueError: If the sample has neither images nor a map, if its images do not fit its
+                cameras or cannot be read, or if the annotation frame is not known.
         """
         meta = data_sample.metainfo
         truth = ground_truth_elements(data_sample)
         threshold = self.score_thr if score_thr is None else score_thr
         predictions = predicted_elements(data_sample)
         note = "no elements"
-        if predictions:
+        if predictions:  # neither None nor empty
             highest = predictions.confidence.max()
             note = f"no score reaches {threshold:g}\n(highest {highest:.2g})"
             predictions = predictions.select(predictions.confidence >= threshold)

@@ -13,13 +13,16 @@ from numpy.typing import NDArray
 
 from gsmap.datasets.errors import BrokenSampleError
 
+# Entries of the results that become metainfo, as far as a pipeline has them.
 META_KEYS = (
     "sample_idx", "token", "scene", "map_name", "timestamp_ns", "seconds", "img_path", "cam_names",
     "lidar2img", "cam2img", "lidar2cam", "img_aug_matrix", "img_shape", "ori_shape",
     "lidar2global", "lidar2ego", "can_bus", "x_range", "y_range", "eval_ann_info",
     "image_steps",
 )  # fmt: skip
+# Entries that become fields of the data sample: the training targets.
 TARGET_KEYS = ("gt_instances_3d", "gt_depth", "gt_seg", "gt_pv_seg", "gt_lines", "gt_directions")
+# Metainfo that earlier transforms store as a list of one matrix (4, 4) per camera.
 _MATRIX_KEYS = ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix")
 
 
@@ -28,8 +31,8 @@ _MATRIX_KEYS = ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix")
 class PackMapInputs(BaseTransform):
     """Pack images, points, targets and metainfo for the model (see ``docs/architecture.md``).
 
-    All targets among ``TARGET_KEYS`` that earlier transforms have added are packed. Lists of V
-    matrices become arrays (V, 4, 4).
+    All targets among ``TARGET_KEYS`` that earlier transforms have added are packed. Lists of the
+    matrices of V cameras become arrays (V, 4, 4).
 
     Args:
         with_points: Whether the model receives the loaded points. Set it to False if the points are
@@ -41,9 +44,12 @@ class PackMapInputs(BaseTransform):
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Pack the sample.
 
+        Args:
+            results: Results of the earlier transforms.
+
         Returns:
-            ``inputs``, with ``img`` (V, 3, H, W) and ``points`` (n, C), and ``data_samples``, with
-            targets and metainfo.
+            ``inputs``, with ``img`` (V, 3, H, W) and ``points`` (n, C) as far as they are loaded,
+            and ``data_samples``, one ``Det3DDataSample`` with targets and metainfo.
 
         Raises:
             BrokenSampleError: If an image has values that are NaN or infinite.
@@ -65,7 +71,11 @@ class PackMapInputs(BaseTransform):
         return {"inputs": inputs, "data_samples": sample}
 
     def _images(self, results: dict[str, Any]) -> torch.Tensor:
-        """Stack images with channels first. V x (H, W, 3) -> (V, 3, H, W)"""
+        """Stack images with channels first. V x (H, W, 3) -> (V, 3, H, W)
+
+        Raises:
+            BrokenSampleError: If an image has values that are NaN or infinite.
+        """
         images = results["img"]
         if results.get("image_steps"):
             # The images are still uint8 as decoded. The data preprocessor applies the recorded
@@ -80,7 +90,7 @@ class PackMapInputs(BaseTransform):
                     f"({results['images'][name]['img_path']}); check the file and the transforms "
                     "before packing."
                 )
-            planes[:] = cv2.split(img)
+            planes[:] = cv2.split(img)  # one plane (H, W) per channel
         return torch.from_numpy(stacked)
 
 

@@ -1,4 +1,7 @@
-"""Evaluation of several metrics over a stream of samples. Only the matches are kept in memory."""
+"""Evaluation of several metrics over a stream of samples.
+
+Only the matches of a sample are kept in memory. Its masks and points are not.
+"""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -25,7 +28,11 @@ from gsmap.utils.errors import InputError
 METRIC_NAMES = ("chamfer", "raster")
 """Default metrics, the metrics of published tables."""
 SampleMatches = dict[str, Matches]
-"""Matches of one sample, by the name of the metric. They are also called records."""
+"""Matches of one sample, by the name of the metric.
+
+The matches of one sample under one metric are also called a record. A metric that matches nothing,
+such as a count of folds, stores its values for the sample in its record.
+"""
 
 
 @dataclass(frozen=True, init=False)
@@ -75,9 +82,10 @@ class MapEvaluator:
                 None keeps the full resolution.
 
         Raises:
-            ValueError: If there is no metric of a name, or the settings do not suit a metric.
+            ValueError: If there is no name, no metric of a name, or ``ground_truth_points`` is less
+                than 2, or if the settings do not suit a metric.
         """
-        metric_types: dict[str, type[Metric]] = {}
+        metric_types: dict[str, type[Metric]] = {}  # a repeated name is one entry
         for name in names:
             metric_type = metric_class(name)
             for companion in metric_type.companions:
@@ -100,13 +108,19 @@ class MapEvaluator:
             predictions: Predicted elements, in metres in the annotation frame. N in number.
             ground_truth: Annotated elements at full resolution. K in number.
             token: Name of the sample; repeated names count once. Default: the number of the sample.
+
+        Raises:
+            ValueError: If the elements do not suit a metric, as in `match`.
         """
         if token is None:
             token = f"{len(self._matches):09d}"
         self._matches.append(self.match(token, predictions, ground_truth=ground_truth))
 
     def compute(self) -> dict[str, float]:
-        """Compute the figures of all samples so far (docs/evaluation.md).
+        """Compute the figures of all samples so far.
+
+        Returns:
+            Figures by keys such as ``chamfer/divider/AP@0.5`` (docs/evaluation.md).
 
         Raises:
             ValueError: If there is no sample.
@@ -119,7 +133,7 @@ class MapEvaluator:
 
     @property
     def canvas(self) -> BEVGrid | None:
-        """Canvas of the first metric that draws elements; None if there is no such metric."""
+        """Raster on which the first metric that draws elements draws them; None if none draws."""
         for metric in self.metrics:
             grid = getattr(metric, "grid", None)
             if isinstance(grid, BEVGrid):
@@ -145,13 +159,23 @@ class MapEvaluator:
             token: Name of the sample.
             predictions: Predicted elements, in metres in the annotation frame. N in number.
             ground_truth: Annotated elements at full resolution. K in number.
+
+        Returns:
+            Record of each metric, by the name of the metric.
+
+        Raises:
+            ValueError: If a label does not fit the classes, predictions have no scores, or a metric
+                in space gets elements without heights.
         """
         if self.ground_truth_points is not None:
             ground_truth = _resample_elements(ground_truth, self.ground_truth_points)
         return self._match_sample(Sample(token, predictions, ground_truth))
 
     def match_empty(self) -> SampleMatches:
-        """Match a sample without elements, to get the names and shapes of the records."""
+        """Match a sample without elements, to get the names and shapes of arrays in the records.
+
+        Records that are read from a file are checked against them.
+        """
         points = np.empty((0, 3))  # with heights, which metrics in space require
         truth = replace(MapElements.from_polylines(), points=points)
         predictions = replace(MapElements.from_polylines(scores=()), points=points)
@@ -163,7 +187,7 @@ class MapEvaluator:
         return {metric.name: metric.match(sample) for metric in self.metrics}
 
     def match_all(self, samples: Iterable[Sample]) -> list[SampleMatches]:
-        """Match several samples under every metric."""
+        """Match several samples under every metric. The records are in the order of the samples."""
         return [
             self.match(sample.token, sample.predictions, ground_truth=sample.ground_truth)
             for sample in samples
@@ -175,9 +199,13 @@ class MapEvaluator:
         Args:
             samples: Records of each sample, as ``match`` returns them.
 
+        Returns:
+            Reports of all metrics, in the order of the metrics. A metric may have several reports.
+
         Raises:
             ValueError: If there is no sample.
         """
+        # Records of all samples, by the name of the metric. The kind of record selects the table.
         tables: dict[str, MatchTable | ValueTable] = {}
         for sample in samples:
             for name, record in sample.items():

@@ -21,7 +21,8 @@ from gsmap.structures.elements import BoolArray, FloatArray, MapElements
 from gsmap.structures.polylines import arc_lengths, resample
 from gsmap.utils.errors import InputError
 
-_POINTS = 128  # points of an element, at equal distances
+_POINTS = 128  # number of points P to which elements and lines are resampled, at equal distances
+# Columns of the counts of a class. `Topology.reports` defines the first three.
 _COUNTS = ("breaks", "false_joints", "folds", "num_gts", "num_preds")
 _FOLD_CHORD_M = 2.0  # length of the chords before and after a fold
 _FOLD_COS = -0.5  # cosine of 120 degrees, the smallest angle between both chords at a fold
@@ -37,8 +38,9 @@ class Topology(Metric):
         area_labels: Labels of classes whose elements enclose an area.
         min_score: Smallest score of a prediction that counts, in [0, 1].
         tolerance_m: Largest distance in metres at which a line covers a point of another line.
-        min_piece_m: Length in metres of the shortest piece that counts, > 2 ``tolerance_m``. So a
-            line that crosses another line does not cover a piece of it.
+        min_piece_m: Length in metres of the shortest piece that counts, > 2 ``tolerance_m``. A line
+            that crosses another line at a right angle is within the tolerance over a length of
+            2 ``tolerance_m``. This is too short to count as a piece.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -70,9 +72,19 @@ class Topology(Metric):
         return replace(metric, min_score=settings.min_score)
 
     def match(self, sample: Sample) -> SampleValues:
-        """Count the errors of one sample."""
+        """Count the errors of one sample.
+
+        Args:
+            sample: Predictions with scores, and ground truth.
+
+        Returns:
+            ``counts`` of each class, with the columns ``_COUNTS``. (C, 5)
+
+        Raises:
+            ValueError: If a label does not fit the classes, or predictions have no scores.
+        """
         token, predictions, truth = sample
-        check_pair(predictions, truth, self.classes, token)
+        check_pair(predictions, truth, self.classes, token)  # raises the errors
         counts = np.zeros((len(self.classes), len(_COUNTS)))
         for label in range(len(self.classes)):
             is_confident = predictions.confidence >= self.min_score
@@ -82,6 +94,8 @@ class Topology(Metric):
             for line in preds:
                 num_folds += count_folds(line, is_area=label in self.area_labels)
             counts[label] = (  # in the order of _COUNTS
+                # A break is a further prediction along one ground truth. A false joint is a further
+                # ground truth along one prediction.
                 _count_excess_pieces(gts, lines=preds, config=self),
                 _count_excess_pieces(preds, lines=gts, config=self),
                 num_folds,
@@ -99,7 +113,10 @@ class Topology(Metric):
         are the numbers of ground truths and predictions.
 
         Args:
-            table: Values of all samples.
+            table: Records of `match` for all samples.
+
+        Returns:
+            One report.
         """
         totals = np.sum(table.column("counts"), axis=0)  # (C, 5)
         figures = {}
@@ -112,8 +129,9 @@ class Topology(Metric):
 def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
     """Count the lines that are needed to cover an element.
 
-    Lines are chosen greedily: the next line covers most points of the element that no chosen line
-    covers.
+    Lines are chosen greedily. The gain of a line is the number of points that it covers and that
+    no chosen line covers yet. The next line is the one with the largest gain. The choice ends when
+    the gain, as a length, is smaller than ``min_piece_m``.
 
     Args:
         covered: Whether each of M lines covers each point of the element, at equal distances.
@@ -121,10 +139,10 @@ def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
         step_m: Distance of neighbouring points in metres.
         min_piece_m: Length in metres of the shortest piece that counts.
     """
-    is_free = np.ones(covered.shape[1], dtype=bool)
+    is_free = np.ones(covered.shape[1], dtype=bool)  # points that no chosen line covers. (P,)
     num_pieces = 0
-    while len(covered):
-        gains = (covered & is_free).sum(axis=1)
+    while len(covered):  # without lines, there is no piece
+        gains = (covered & is_free).sum(axis=1)  # (M,)
         best = int(gains.argmax())
         # `not >=` also ends the loop for NaN, which is the product of 0 points and an infinite step
         # (of a line with huge coordinates).
@@ -144,6 +162,7 @@ def _count_excess_pieces(
     """
     if not lines:
         return 0
+    # Distances are measured from the points of an element to whole lines, not to their points.
     curves = shapely.linestrings([_resample_flat(line) for line in lines])
     num_excess = 0
     for element in elements:
@@ -171,17 +190,19 @@ def count_folds(line: FloatArray, is_area: bool) -> int:
         is_area: Whether the line encloses an area.
     """
     if is_area:
+        # The first point is appended, so that the outline is closed.
         ring = shapely.LineString(np.concatenate([line[:, :2], line[:1, :2]]))
         return int(not ring.is_simple)
     points = _resample_flat(line)
     length = arc_lengths(line)[-1]
-    if not 2 * _FOLD_CHORD_M <= length < np.inf:
+    if not 2 * _FOLD_CHORD_M <= length < np.inf:  # too short for two chords, or of infinite length
         return 0
     span = max(round(_FOLD_CHORD_M / length * (_POINTS - 1)), 1)  # steps between points per chord
     chords = points[span:] - points[:-span]
     before = chords[:-span]  # each one ends where the chord of equal index in `after` starts
     after = chords[span:]
     lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    # The scalar product of two chords is the cosine of their angle times their lengths.
     is_fold = (before * after).sum(axis=1) < _FOLD_COS * lengths
     # A fold at several successive points counts once, at the first of them.
     starts_fold = is_fold[1:] & ~is_fold[:-1]

@@ -1,6 +1,7 @@
 """Auxiliary heads that predict masks in bird's-eye and camera view, used in training only.
 
-Each head has the name of its loss (``name``), the names of the transforms that make its target
+An auxiliary head improves the features in training, and has no output in prediction. Each head has
+the name of its loss (``name``), the names of the pipeline transforms that make its target
 (``transforms``), and a method ``loss(bev_outputs, samples)``.
 """
 
@@ -25,7 +26,7 @@ def stack_targets(head: Any, samples: Samples, name: str, device: torch.device) 
     """Stack the training targets of all samples.
 
     Args:
-        head: Auxiliary head, for the name of its transform in the error.
+        head: Auxiliary head. The first of its ``transforms`` is named in the error.
         samples: Samples of the batch, each with the target.
         name: Field of the target.
         device: Device of the result.
@@ -57,12 +58,13 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
         pos_weight: Weight of foreground cells in the cross-entropy.
         dice_weight: Weight of the dice loss, which treats the masks of a sample as one.
         num_masks: Number of predicted masks: the number of classes for one mask per class, or 1 for
-            one mask of all elements.
+            one mask of all elements. For 1, the masks of the classes in the target are united.
         name: Name of the loss.
 
     Attributes:
         feats: Key of the features in the outputs of the BEV encoder.
         target: Field of the target in a sample.
+        transforms: Transforms of the training pipeline that make the target.
     """
 
     feats = "bev_feats"  # (B, C, H, W)
@@ -114,7 +116,7 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
         # B samples; targets of V cameras, (B, V, masks, h, w), get one axis of B * V images.
         target = target.flatten(0, -4)
         if self.num_masks == 1:
-            target = target.amax(1, keepdim=True)
+            target = target.amax(1, keepdim=True)  # union of the masks of all classes
         elif target.shape[1] != self.num_masks:
             raise InputError(
                 f"{self.target} has {target.shape[1]} channels, {self.num_masks} masks are "
@@ -134,7 +136,7 @@ class PVMaskHead(BEVMaskHead):
         loss_weight: Weight of the cross-entropy.
         pos_weight: Weight of foreground cells in the cross-entropy.
         name: Name of the loss.
-        kwargs: Further arguments of `BEVMaskHead`.
+        kwargs: ``dice_weight`` and ``num_masks`` of `BEVMaskHead`.
     """
 
     feats = "img_feats"  # (B, V, C, h, w)
@@ -172,6 +174,7 @@ def class_mask_losses(
     check_same_shape(logits=logits, targets=targets)
     logits = logits.float()
     targets = targets.float()
+    # `constant` caches the tensor. A new tensor in each step would wait for the GPU.
     weight = constant(logits, pos_weight, torch.float)
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
     # All classes of a sample count as one mask, (B, classes * H, W).

@@ -1,4 +1,8 @@
-"""Qualities of matched Gaussians, for classification losses with a quality as target."""
+"""Qualities of matched Gaussians, for classification losses with a quality as target.
+
+A quality in [0, 1] measures how well a prediction fits the ground truth that it is matched with.
+Qualities are targets, so no gradient flows through them.
+"""
 
 from collections.abc import Sequence
 from typing import cast
@@ -18,8 +22,8 @@ from gsmap.structures.gaussians import extents_along_line, line_errors
 class ErrorQuality(Quality):
     r"""Quality by the predicted uncertainty of points: the mean of :math:`\exp(-d^2 / 2 \sigma^2)`.
 
-    The mean is over the points of an element. d is the error and sigma the standard deviation
-    across the line, both in metres.
+    The mean is over the points of an element. For each point, d is the error across the line, and
+    sigma is the predicted standard deviation across the line, both in metres.
 
     Args:
         largest_m: Upper limit of sigma in metres, so that a large sigma cannot raise the quality of
@@ -37,7 +41,8 @@ class ErrorQuality(Quality):
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Quality of each matched pair. (M,)"""
         reference = cast(GaussianReference, pairs.predictions.reference)
-        # Gaussians of the point errors: their sigmas are the predicted uncertainty of the points.
+        # `errors` decodes the predictions to Gaussians in metres. Their sigmas are the predicted
+        # uncertainty of the points. (M, P)
         gaussians = reference.errors(pairs.pred_references.detach())
         sigmas = extents_along_line(gaussians)  # along, across (M, P, 2)
         errors = line_errors(gaussians.means, pairs.gt_pts_m[..., :2])  # along, across (M, P, 2)
@@ -48,7 +53,10 @@ class ErrorQuality(Quality):
 
 @MODELS.register_module()
 class MaskQuality(Quality):
-    """Quality by the soft IoU of the rendered mask and the ground-truth mask, as in AP_raster."""
+    """Quality by the soft IoU of the rendered mask and the ground-truth mask.
+
+    The metric AP_raster matches elements by the IoU of their masks, too.
+    """
 
     def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the head has no Gaussians."""
@@ -64,7 +72,7 @@ class ProductQuality(Quality):
     """Product of several qualities.
 
     Args:
-        qualities: Configs of the factors.
+        qualities: Configs of the factors, one or more, such as ``dict(type="MaskQuality")``.
     """
 
     def __init__(self, qualities: Sequence[PartConfig]) -> None:

@@ -18,7 +18,7 @@ from gsmap.utils.errors import InputError
 
 
 def conv_block(inputs: int, outputs: int) -> list[nn.Module]:
-    """Return a 3x3 convolution, its normalisation and a ReLU."""
+    """Return a 3x3 convolution without bias, its batch normalisation and a ReLU."""
     conv = nn.Conv2d(inputs, outputs, kernel_size=3, padding=1, bias=False)
     return [conv, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
 
@@ -61,7 +61,11 @@ class JoinLevels(BaseModule):
         self.joined = JoinedMaps(sum(in_channels), out_channels)
 
     def forward(self, feats: Sequence[Tensor]) -> tuple[Tensor]:
-        """Fuse both levels. Two (n, C, h, w) -> one (n, out_channels, h, w)"""
+        """Fuse both levels. The tuple has one level, because an image neck returns a sequence.
+
+        Two levels (n, C, h, w) of different sizes -> one level (n, out_channels, h, w) of the finer
+        size.
+        """
         fine, coarse = feats
         return (self.joined(fine, coarse),)
 
@@ -71,10 +75,10 @@ class ViewTransformEncoder(CameraEncoder):
     """BEV encoder with a learned view transformation for each camera (HDMapNet, III-B).
 
     For each camera, a fully connected network transforms the pixels of a feature channel to a
-    top-down camera map, with weights shared by all channels. The camera map has 2/3 of the length
-    and width of the BEV. It begins ahead of the camera, at a distance of an eighth of the length of
-    the camera map. A BEV cell takes the maximum over all camera maps. Intrinsics are not used, so
-    the weights fit one set of cameras and one image size.
+    camera map, a map of the ground ahead of the camera from above. All channels share the weights.
+    The camera map has 2/3 of the length and width of the BEV. It begins ahead of the camera, at a
+    distance of an eighth of the length of the camera map. A BEV cell takes the maximum over all
+    camera maps. Intrinsics are not used, so the weights fit one set of cameras and one image size.
 
     Args:
         grid: Extent of the map, in metres.
@@ -90,7 +94,7 @@ class ViewTransformEncoder(CameraEncoder):
         ValueError: If the features or the camera maps would be empty.
     """
 
-    calibration = ("cam_from_ground",)
+    calibration = ("cam_from_ground",)  # the array that `encode` receives
 
     def __init__(
         self,
@@ -103,7 +107,7 @@ class ViewTransformEncoder(CameraEncoder):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid = grid.rasterized(bev_pixel_m)
+        self.grid = grid.rasterized(bev_pixel_m)  # the extent of `grid` in cells of this side
         self.released_units = released_units
         self.view_pixel_m = bev_pixel_m / 0.6  # side of a cell of a camera map: 5/3 of a BEV cell
         self.feature_size = (image_size[0] // stride, image_size[1] // stride)
@@ -118,15 +122,15 @@ class ViewTransformEncoder(CameraEncoder):
             )
         num_inputs = self.feature_size[0] * self.feature_size[1]
         num_cells = self.view_size[0] * self.view_size[1]
-        self.views = nn.ModuleList()
+        self.views = nn.ModuleList()  # the network of each camera
         for _ in range(num_cams):
-            view = nn.Sequential(
+            network = nn.Sequential(
                 nn.Linear(num_inputs, num_cells),
                 nn.ReLU(),
                 nn.Linear(num_cells, num_cells),
                 nn.ReLU(),
             )
-            self.views.append(view)
+            self.views.append(network)
 
     def encode(
         self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
@@ -142,10 +146,13 @@ class ViewTransformEncoder(CameraEncoder):
         Returns:
             ``bev_feats``, 0 where no camera map covers a cell. (B, C, H, W)
         """
-        views = self.transform_views(feats)
-        positions = self.cell_positions(calibration["cam_from_ground"])
-        samples = sample_maps(views.flatten(0, 1), positions.flatten(0, 1))  # (B * V, C, H, W)
-        return {"bev_feats": samples.unflatten(0, views.shape[:2]).amax(dim=1)}
+        camera_maps = self.transform_views(feats)  # (B, V, C, rows, columns)
+        positions = self.cell_positions(calibration["cam_from_ground"])  # (B, V, H, W, 2)
+        samples = sample_maps(camera_maps.flatten(0, 1), positions.flatten(0, 1))
+        samples = samples.unflatten(0, camera_maps.shape[:2])  # (B, V, C, H, W)
+        # Camera maps are >= 0, because they come from a ReLU. So the 0 of a camera that does not
+        # cover a cell never exceeds the value of another camera.
+        return {"bev_feats": samples.amax(dim=1)}
 
     def transform_views(self, feats: Tensor) -> Tensor:
         """Transform the features of each camera to its top-down camera map.
@@ -170,7 +177,7 @@ class ViewTransformEncoder(CameraEncoder):
                 "stride of ViewTransformEncoder to the values of the images."
             )
         pixels = feats.flatten(3).unbind(dim=1)  # (B, C, h * w) for each camera
-        maps = [view(values) for view, values in zip(self.views, pixels, strict=True)]
+        maps = [network(inputs) for network, inputs in zip(self.views, pixels, strict=True)]
         return torch.stack(maps, dim=1).unflatten(-1, self.view_size)
 
     def cell_positions(self, cam_from_ground: Tensor) -> Tensor:
@@ -183,6 +190,7 @@ class ViewTransformEncoder(CameraEncoder):
         Returns:
             Continuous column and row of each cell. (B, V, H, W, 2)
         """
+        # Half precision would be too coarse for positions.
         with torch.autocast(cam_from_ground.device.type, enabled=False):
             matrices = cam_from_ground.float()
             cells = self.cell_coordinates(matrices.device)
@@ -190,6 +198,7 @@ class ViewTransformEncoder(CameraEncoder):
             # needed, because the points lie on the ground, where z = 0.
             rotations = matrices[..., [0, 2], :2]
             rotated_cells = torch.einsum("bvij,hwj->bvhwi", rotations, cells)
+            # Camera positions stay in metres, or become cells of the camera maps.
             unit = 1.0 if self.released_units else self.view_pixel_m
             offsets = matrices[..., [0, 2], 3] / unit  # (B, V, 2)
             right, depth = (rotated_cells + offsets[:, :, None, None]).unbind(dim=-1)

@@ -1,7 +1,8 @@
 """PivotNet's dynamic matching of the pivots of annotated lines with predicted points.
 
-Pivots are the vertices that define the shape of a line, including its two ends. Each pivot is
-matched with one predicted point, in order. Predicted points may remain without a pivot.
+Pivots are the vertices that define the shape of a line, including its two ends. The points of a
+predicted line have an order, too. Each pivot is matched with one predicted point, and the order of
+the pivots is kept. Predicted points may remain without a pivot.
 """
 
 import numpy as np
@@ -19,7 +20,7 @@ def path_costs(costs: Floats) -> Floats:
     pivots 0 to i if pivot i is matched with point j. It is infinite if that is not possible.
 
     Args:
-        costs: Differences between m pivots and p points. (..., m, p)
+        costs: Cost of matching each of m pivots with each of p points. (..., m, p)
 
     Returns:
         Lowest total costs. (..., m, p)
@@ -37,18 +38,21 @@ def sequence_costs(costs: Floats, lengths: NDArray[np.integer], end_weight: floa
     """Compute the mean matching costs of predicted and annotated lines.
 
     Args:
-        costs: Differences between the pivots of K annotated lines and the points of N predicted
-            lines. The last pivot is matched with the last point. (N, K, m, p)
-        lengths: Number of pivots of each annotated line. (K,)
-        end_weight: Additional weight of the ends of a line, >= 0.
+        costs: Cost of matching each of m pivots of K annotated lines with each of p points of N
+            predicted lines. The first pivot is matched with the first point, and the last pivot
+            with the last point. (N, K, m, p)
+        lengths: Number of pivots of each annotated line, at most m. Rows of ``costs`` beyond it are
+            ignored. (K,)
+        end_weight: Additional weight of the two ends of a line, >= 0.
 
     Returns:
-        Mean cost of each pair of lines. (N, K)
+        Mean cost of each pair of lines, infinite if a line has more pivots than points. (N, K)
     """
-    lines = np.arange(len(lengths))
+    line_indices = np.arange(len(lengths))
     last_pivots = lengths - 1
-    totals = path_costs(costs)[:, lines, last_pivots, -1]
-    ends = costs[..., 0, 0] + costs[:, lines, last_pivots, -1]
+    totals = path_costs(costs)[:, line_indices, last_pivots, -1]
+    ends = costs[..., 0, 0] + costs[:, line_indices, last_pivots, -1]
+    # Each of the two ends has the weight 1 + end_weight, and the other pivots have the weight 1.
     return (totals + end_weight * ends) / (lengths + 2 * end_weight)
 
 
@@ -56,7 +60,7 @@ def match_pivots(costs: Floats) -> NDArray[np.int64]:
     """Return the point that is matched with each pivot, the first one of equally good points.
 
     Args:
-        costs: Differences between m pivots and p points. (m, p)
+        costs: Cost of matching each of m pivots of a line with each of p points. (m, p)
 
     Returns:
         Indices of the points, increasing. (m,)
@@ -72,5 +76,6 @@ def match_pivots(costs: Floats) -> NDArray[np.int64]:
     # The last pivot is matched with the last point. From there backwards, each previous pivot is
     # matched with the best earlier point.
     for row in range(num_pivots - 1, 0, -1):
-        path[row - 1] = table[row - 1, : path[row]].argmin()
+        earlier_points = slice(0, path[row])
+        path[row - 1] = table[row - 1, earlier_points].argmin()
     return path

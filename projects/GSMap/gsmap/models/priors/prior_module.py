@@ -1,4 +1,7 @@
-"""Base class of the parts of a detector that read maps of earlier frames."""
+"""Base class of the parts of a detector that read maps of earlier frames.
+
+A map prior, or prior, is a map of one place: the predictions of earlier frames in a town or scene.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,13 +21,15 @@ from gsmap.utils.errors import InputError
 class PriorModule(BaseModule):
     """Part ``prior`` of a `MapDetector`, which reads maps of earlier frames.
 
-    For each batch the detector calls `fuse` with the outputs of the encoder, `hook` for a hook into
-    the head, `update_detections` with the detections, and `keep` with the hook. In this base class,
-    these methods have no effect.
+    For each batch the detector calls four methods in this order: `fuse` with the outputs of the
+    encoder, `hook` for an object that takes part in the steps of the head, `update_detections` with
+    the detections of a prediction, and `keep` with the hook, which has then received the
+    predictions of the head. In this base class, these methods have no effect.
 
     Args:
         head: Head of the detector, a `MapHead`.
         cell_m: Side in metres of the square cells at which maps are read.
+        init_cfg: Initialisation config of mmengine.
 
     Attributes:
         reads_window: Whether `fuse` needs a window of a map, which is then an input of an exported
@@ -44,11 +49,11 @@ class PriorModule(BaseModule):
             raise InputError(f"{type(head).__name__} can have no prior, which needs a MapHead.")
         self.window = head.grid.rasterized(cell_m)
         self.classes = head.classes
-        self._given: PlaceMaps | None = None
+        self._given: PlaceMaps | None = None  # maps of `use`; None for the maps of the model
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        """Names of the arrays of calibration that `fuse` reads."""
+        """Names of the arrays of calibration that `fuse` reads; none in this base class."""
         return ()
 
     def new_maps(self) -> PlaceMaps:
@@ -62,27 +67,30 @@ class PriorModule(BaseModule):
             place: Name of the place.
 
         Raises:
-            ValueError: If the model writes to no prior.
+            ValueError: If the model writes to no prior, as in this base class.
         """
         raise InputError(
             f"a model with {type(self).__name__} writes to no prior: leave the update out."
         )
 
     def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
-        """Maps from the priors of a user, as arguments of `use` and `using`.
+        """Wrap the priors of a user as maps for `use` and `using`.
 
         Args:
             priors: The priors, one for each place.
-            update: Write each frame to the priors after it is predicted.
+            update: Whether each frame is written to the priors after it is predicted.
+
+        Returns:
+            Maps that find the prior of a frame by the place of the frame.
 
         Raises:
-            ValueError: If a prior has other classes or cells, if two priors are of one place, or if
-                this module does not read or write such priors.
+            ValueError: If there is no prior, if a prior has other classes or cells, if two priors
+                are of one place, or if this module does not read or write such priors.
         """
         return GivenMaps(priors, self.classes, grid=self.window, update=update)
 
     def flush(self) -> None:
-        """Write the predictions that were passed to `keep` into the maps."""
+        """Write the predictions that were passed to `keep` into the maps they were made with."""
 
     def use(self, maps: PlaceMaps | None) -> None:
         """Use these maps in tests from now on.
@@ -90,7 +98,7 @@ class PriorModule(BaseModule):
         Args:
             maps: Maps of `maps_of` or `new_maps`; None for the maps of the model.
         """
-        self.flush()
+        self.flush()  # predictions so far belong to the maps before
         self._given = maps
 
     @contextmanager
@@ -105,7 +113,7 @@ class PriorModule(BaseModule):
         try:
             yield
         finally:
-            self.use(previous)
+            self.use(previous)  # writes the predictions first
 
     def fuse(
         self,
@@ -121,7 +129,7 @@ class PriorModule(BaseModule):
             img_shape: Rows and columns of the padded images.
 
         Returns:
-            The outputs for the head.
+            The outputs for the head, in a new dictionary.
         """
         return dict(outputs)
 
@@ -141,6 +149,9 @@ class PriorModule(BaseModule):
         Args:
             results: Detections of each sample, as predicted by the head.
             metas: Metainfo of each sample.
+
+        Returns:
+            Detections of each sample.
         """
         return list(results)
 
@@ -148,6 +159,6 @@ class PriorModule(BaseModule):
         """Store the predictions of a batch until `flush` writes them.
 
         Args:
-            hook: Hook of the batch, after the head has run.
+            hook: Result of `hook` for the batch, after the head has run; not called without a hook.
             metas: Metainfo of each sample.
         """

@@ -20,7 +20,8 @@ class SmoothPointsLoss(MapLoss):
     Args:
         loss_weight: Weight of the loss.
         beta: Distance in [0, 1] over the map below which the loss is quadratic, > 0.
-        flags: Flags ``last_layer_only`` and ``first_group_only`` of `MapLoss`.
+        flags: Flags ``last_layer_only`` and ``first_group_only`` of `MapLoss`, which restrict the
+            loss to the last decoder layer or to the first query group.
     """
 
     name = "pts"
@@ -30,10 +31,13 @@ class SmoothPointsLoss(MapLoss):
         self.beta = beta
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Compute the distance of each coordinate, divided by P. (M, P, 2 or 3)"""
+        """Compute the distance of each coordinate, divided by P. (M, P, 2 or 3)
+
+        `MapLoss` sums and weights the distances. The targets are in the point order of the match.
+        """
         pred = pairs.pred_pts
         target = pairs.gt_pts
-        check_same_shape(pred=pred, target=target)
+        check_same_shape(pred=pred, target=target)  # other shapes could broadcast
         return F.smooth_l1_loss(pred, target, reduction="none", beta=self.beta) / pred.shape[1]
 
 
@@ -41,7 +45,8 @@ class SmoothPointsLoss(MapLoss):
 class SmoothPointsCost(OrderedPointsCost):
     """Smooth L1 distance to the closest equivalent point order, divided by the number of points.
 
-    The distance also determines the point order of matched pairs.
+    Equivalent orders describe one element, such as both directions of a line. The distance also
+    determines the point order of matched pairs.
 
     Args:
         weight: Weight of the cost.
@@ -54,6 +59,8 @@ class SmoothPointsCost(OrderedPointsCost):
 
     def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
         """Compute the distance of each coordinate between two lists of points.
+
+        The base class calls it to select the point order of matched pairs.
 
         Args:
             pts: Normalised points. (..., P, 2 or 3)
@@ -82,5 +89,5 @@ class SmoothPointsCost(OrderedPointsCost):
         pts = pred_instances.pts[:, None, None]  # (N, 1, 1, P, 2)
         pts = pts.expand((len(pts), *orders.shape))  # (N, K, S, P, 2)
         distances = self.between_points(pts, orders.expand_as(pts)).sum(dim=(-1, -2))
-        closest = distances.amin(dim=-1) / pts.shape[-2]
+        closest = distances.amin(dim=-1) / pts.shape[-2]  # (N, K)
         return closest * class_weights(self.weight, gt_instances.labels)

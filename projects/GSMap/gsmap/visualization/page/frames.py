@@ -1,4 +1,7 @@
-"""Frames of the report page: choice of samples, maps in centimetres, cameras and thumbnails."""
+"""Frames of the report page: choice of samples, maps in centimetres, cameras and thumbnails.
+
+The values of a frame become JSON in the page. Short keys and whole centimetres keep the page small.
+"""
 
 import base64
 from collections.abc import Sequence
@@ -42,7 +45,7 @@ def choose_frames(
     """
     if len(tokens) <= max_frames:
         return list(range(len(tokens)))
-    num_even = max_frames
+    num_even = max_frames  # number of evenly spread samples
     if results:
         num_even -= max_frames // 4
     even = np.linspace(0, len(tokens) - 1, num_even).round().astype(int)
@@ -53,7 +56,7 @@ def choose_frames(
             f1.append(np.array([result.f1(token, score_thr) for token in tokens]))
         # The samples with the lowest ranking values are chosen.
         ranking = f1[0] if len(f1) == 1 else -abs(f1[0] - f1[1])
-        num_chosen = len(chosen) + max_frames - num_even
+        num_chosen = len(chosen) + max_frames - num_even  # samples so far, and the last quarter
         for index in np.argsort(ranking, kind="stable").tolist():
             if len(chosen) == num_chosen:
                 break
@@ -62,7 +65,10 @@ def choose_frames(
 
 
 def to_centimetres(points: np.ndarray, view: FrameView) -> list[int]:
-    """Convert points (n, 2) from metres to (right, ahead) in whole centimetres, flat. (2 n,)"""
+    """Convert points (n, 2) in metres to alternating values right and ahead in whole centimetres.
+
+    Returns a flat list of 2 n values.
+    """
     centimetres = np.rint(100 * view.display_from_frame(points)).astype(int)
     return centimetres.ravel().tolist()
 
@@ -75,7 +81,7 @@ def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
         view: Orientation of the annotation frame.
 
     Returns:
-        Class ``c`` and points ``p`` in centimetres of each element.
+        Class index ``c`` and points ``p`` (`to_centimetres`) of each element.
     """
     elements = elements_of_instances(sample.instances or [])
     entries = []
@@ -95,11 +101,12 @@ def predictions_of(token: str, result: ScoredResult, view: FrameView) -> list[di
         view: Orientation of the annotation frame.
 
     Returns:
-        For each prediction, its class ``c``, score ``s``, points ``p`` in centimetres and ``hit``,
-        the index of the ground truth that it hits within 1 m, or -1. With Gaussians, also ``g``:
-        for each point, sigma along both axes in centimetres and the angle in the display in
-        degrees.
+        For each prediction, its class index ``c``, score ``s``, points ``p`` (`to_centimetres`) and
+        ``hit``, the index of the ground truth that it hits within 1 m, or -1. With Gaussians, also
+        ``g``: for each point, sigma along both axes in centimetres and the angle of the first axis
+        in the display in degrees, in one flat list.
     """
+    # Matches are sorted by score. `pred_index` has the indices of the predictions in this order.
     matches = result.matches[token]
     is_shown = matches.scores >= MIN_SCORE
     if not is_shown.any():
@@ -166,12 +173,15 @@ def cameras_of(
         sample: Sample of the annotation file.
         view: Orientation and ground plane of the annotation frame.
         data_root: Folder that image paths are relative to.
-        width_px: Largest width of the images in pixels, doubled for the camera that looks ahead;
-            0 leaves images out.
+        width_px: Largest width of the images in pixels, doubled for the camera in the middle of the
+            first row; 0 leaves images out.
 
     Returns:
-        For each camera, its ``title``, ``size`` in pixels, homography ``matrix`` from metres on
-        the ground in the display to pixels, (9,), and image ``src`` as a data URI.
+        A row of the cameras that look ahead, then a row of the cameras that look back, each from
+        left to right and without empty rows. An entry has the ``title`` of a camera, its ``size``
+        (width, height) in pixels, its homography ``matrix`` from metres on the ground in the
+        display to pixels, (9,), and its image ``src`` as a data URI. ``src`` is empty without
+        images.
 
     Raises:
         ValueError: If an image is missing or damaged.
@@ -181,9 +191,9 @@ def cameras_of(
         entries = []
         for index, camera in enumerate(row):
             matrix = _img_from_display(camera, view)
-            is_front_row = not rows
-            looks_ahead = is_front_row and index == len(row) // 2  # the middle camera
-            largest_px = 2 * width_px if looks_ahead else width_px
+            is_first_row = not rows
+            is_main_camera = is_first_row and index == len(row) // 2  # usually looks straight ahead
+            largest_px = 2 * width_px if is_main_camera else width_px
             entry = {
                 "title": camera_title(camera.name),
                 "size": [camera.width, camera.height],
