@@ -180,6 +180,13 @@ def test_every_kind_of_panel_is_drawn():
         assert colour_share(picture, STYLE.colour(0)) > 0.08  # the full raster
 
 
+def test_a_small_map_without_ticks_and_a_line_of_one_point_are_drawn():
+    grid = BEVGrid((1.0, 4.0), (1.0, 4.0), 10, 10)
+    single = MapElements.from_polylines((np.array([[2.0, 2.0]]),), np.array([0]))
+    panel = BEVPanel("", single, order=True)
+    compose_figure([], [panel], grid, VIEW, STYLE)
+
+
 def test_gaussian_ellipse_has_its_one_sigma_size():
     # 4 m along x and 2 m along y, turned by 90 degrees: at 1 sigma it is 4 m wide and 8 m high.
     single = MapElements.from_polylines(

@@ -110,6 +110,11 @@ def test_fog_leaves_five_percent_of_the_contrast_at_the_end_of_sight():
     assert 1 - centre[10] == pytest.approx(0.05 ** (60 / 40), abs=0.002)  # a house: 60 m
 
 
+def test_fog_needs_the_height_of_the_cameras():
+    with pytest.raises(ValueError, match="sample 'a' has no ego_from_frame, which fog needs"):
+        CorruptImages("fog", 1).transform({**results(), "lidar2ego": None})
+
+
 @pytest.mark.parametrize(("kind", "severity"), [("snow", 1), ("fog", 0), ("fog", 6)])
 def test_unknown_corruptions_are_refused(kind, severity):
     with pytest.raises(ValueError, match="kind must be one of"):
@@ -132,6 +137,18 @@ def test_delayed_cameras_show_the_sample_before(tmp_path):
         for name, image in found.items():
             assert name in image["img_path"]
             assert image["size"] == 1
+
+
+def test_a_camera_that_the_sample_before_lacks_is_not_delayed(tmp_path):
+    before, now = sample(0, timestamp_ns=1), sample(1, timestamp_ns=2)
+    before = replace(before, cameras=before.cameras[:1])
+    write_annotations(tmp_path / "a.arrow", META, [before, now])
+    step = DelayCameras("a.arrow", severity=5, data_root=str(tmp_path))
+    images = {c.name: {"img_path": str(tmp_path / c.path)} for c in now.cameras}
+    found = step.transform({"token": now.token, "images": images})["images"]
+    kept, late = now.cameras[0], before.cameras[0]
+    assert found.pop(kept.name)["img_path"] == str(tmp_path / late.path)
+    assert found == {name: image for name, image in images.items() if name != kept.name}
 
 
 def test_training_drops_some_cameras_of_some_samples():

@@ -107,12 +107,13 @@ def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float,
 def _ticks(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     """Multiples of 10 m (5 m on a small map) between two bounds in metres, and their labels.
 
-    The last label also has the unit.
+    The last label also has the unit. A map without a multiple has no labels.
     """
     step = 10 if high - low > 20 else 5
     positions = np.arange(np.ceil(low / step) * step, high + 1e-6, step)
     labels = [f"{position:g}".replace("-", "\N{MINUS SIGN}") for position in positions]
-    labels[-1] += " m"
+    if labels:
+        labels[-1] += " m"
     return positions, labels
 
 
@@ -202,11 +203,13 @@ def draw_lines(
 
 def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
     """Mark the first vertex of each line with a ring, and the direction with an arrow head."""
-    starts = np.stack([line[0] for line in lines])  # (N, 2)
+    starts = np.array([line[0] for line in lines]).reshape(-1, 2)  # (N, 2)
     x, y = starts.T
     ax.scatter(x, y, s=13, facecolors="white", edgecolors=colours, linewidths=1.0, zorder=13)
     for line, colour in zip(lines, colours, strict=True):
-        middle = max(len(line) // 2, 1)
+        if len(line) < 2:  # a single vertex has no direction
+            continue
+        middle = len(line) // 2
         head = {
             "arrowstyle": "-|>",
             "lw": 0,

@@ -162,7 +162,15 @@ def fog(results: dict[str, Any], view: int, visibility_m: float) -> NDArray[Any]
 
     Returns:
         Image. (H, W, 3)
+
+    Raises:
+        ValueError: If the pose of the annotation frame on the vehicle is unknown.
     """
+    if results["lidar2ego"] is None:
+        raise InputError(
+            f"sample {results['token']!r} has no ego_from_frame, which fog needs for the height of "
+            "the cameras: add it to the annotation file, or leave out fog."
+        )
     image = results["img"][view]
     height, width = image.shape[:2]
     cols, rows = np.meshgrid(np.arange(width), np.arange(height))
@@ -269,7 +277,8 @@ KINDS = ("camera_lost", *_CALIBRATION_ERRORS, "fog", *_IMAGE_CORRUPTIONS)
 class DelayCameras(BaseTransform):
     """Transform that replaces images of some cameras by images of the scene's previous sample.
 
-    The first sample of a scene does not change. The transform must come before
+    The first sample of a scene does not change, nor do cameras that the previous sample lacks. The
+    transform must come before
     ``LoadCameraImages``.
 
     Args:
@@ -314,11 +323,11 @@ class DelayCameras(BaseTransform):
         if row is None:
             return results
         images = dict(results["images"])
-        names = list(images)
         # Paths of the images of the previous sample.
         paths = {camera.name: camera.path for camera in self._file[row].cameras}
+        names = [name for name in images if name in paths]
         rng = generator(self.seed, results["token"])
-        num_late = min(self.severity, len(names) - 1)
+        num_late = min(self.severity, len(names), len(images) - 1)
         for view in rng.permutation(len(names))[:num_late].tolist():
             name = names[view]
             path = str(Path(self.data_root, paths[name]))
