@@ -18,9 +18,10 @@ from gsmap.prior.rules import WriteRule
 from gsmap.structures.grid import BEVGrid
 
 GRID = BEVGrid(x_range=(-15, 15), y_range=(-30, 30), height=200, width=100)
-SETTINGS = PriorSettings(("divider", "boundary", "ped_crossing"), "benchmark")
+SETTINGS = PriorSettings(classes=("divider", "boundary", "ped_crossing"), place="benchmark")
+# Each rule combines the raster of a new frame with the stored cells in another way.
 RULES: tuple[WriteRule, ...] = (KeepMaximum(), LastSeen(), HitMissCounts())
-LINES_M = (-10.0, -3.5, 0.0, 3.5, 10.0)  # position of each line across the road
+LINES_M = (-10.0, -3.5, 0.0, 3.5, 10.0)  # x of each line in the frame, across the road
 STEP_M = 5.0  # distance between frames
 ROW_M = 10_000.0  # extent of a piece of the road along y; the next piece is 200 m beside it
 
@@ -41,12 +42,13 @@ def run(args: argparse.Namespace) -> None:
     Args:
         args: Parsed options of ``add_arguments``.
     """
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # the priors are compared by the time of one thread
     header = ["rule", "read (ms)", "write (ms)", "drive, per frame (ms)"]
     header += ["file, GB per 1,000 km", "peak memory (MiB)"]
     rows = []
     for rule in RULES:
         read_ms, write_ms = frame_times_ms(rule, repeats=args.repeats)
+        # A fresh process: memory of earlier rules would disturb the peak memory.
         file_bytes, cost = in_own_process(drive, rule, args.km)
         size_gb = file_bytes / 1e9 / args.km * 1000
         num_frames = 1000 * args.km / STEP_M
@@ -61,6 +63,7 @@ def run(args: argparse.Namespace) -> None:
         "processor time and peak memory of this whole work.\n"
     )
     table = markdown_table(header, rows)
+    # `compare` returns a second table, of rasters and the priors that store Gaussians or elements.
     publish(f"{text}\n{table}\n\n{compare(args.compared_km)}", args.out)
 
 
@@ -82,11 +85,11 @@ def prediction(index: int) -> NDArray[np.float32]:
 
 def pose_at(distance_m: float) -> NDArray[np.float64]:
     """Pose at a distance along a road, which consists of parallel winding pieces along y. (4, 4)"""
-    row, along_m = divmod(distance_m, ROW_M)  # index of the piece, and the position on it
+    piece, along_m = divmod(distance_m, ROW_M)  # index of the piece, and the position on it
     yaw = 0.3 * math.sin(distance_m / 300)
     pose = np.eye(4)
     pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    aside_m = 200 * row + 90 * (1 - math.cos(distance_m / 300))
+    aside_m = 200 * piece + 90 * (1 - math.cos(distance_m / 300))
     pose[:2, 3] = [aside_m, along_m]
     return pose
 
@@ -94,9 +97,12 @@ def pose_at(distance_m: float) -> NDArray[np.float64]:
 def cycle_poses(number: int, offset_m: float) -> Iterator[NDArray[np.float64]]:
     """Yield the poses of the first frames of a road in an endless cycle.
 
+    The cycle has no end, because `measure` makes further calls in addition to the timed ones.
+
     Args:
         number: Number of frames.
-        offset_m: Distance along the road from each frame to its pose, in metres.
+        offset_m: Distance in metres by which each pose lies ahead of its frame, as on another drive
+            along the road.
     """
     for index in cycle(range(number)):
         yield pose_at(STEP_M * index + offset_m)
@@ -110,7 +116,7 @@ def frame_times_ms(rule: WriteRule, repeats: int) -> tuple[float, float]:
         repeats: Number of timed frames.
 
     Returns:
-        Processor time of a read and of a write in milliseconds, the shortest of all frames.
+        Processor time in milliseconds of a read, and of a write, each the shortest of all frames.
     """
     prior = MapPrior(SETTINGS, rule)
     values = prediction(0)
@@ -132,11 +138,12 @@ def drive(rule: WriteRule, length_km: float) -> tuple[int, Cost]:
         length_km: Length of the road in kilometres.
 
     Returns:
-        Size of the file in bytes, and cost of the work.
+        Size of the file in bytes, and time and peak memory of the whole work.
     """
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # again, because this function runs in a fresh process
     distances_m = np.arange(0, 1000 * length_km, STEP_M)
     poses = [pose_at(distance_m) for distance_m in distances_m.tolist()]
+    # 40 rasters are used again and again. They are made here, so that their time is not measured.
     rasters = [prediction(index) for index in range(40)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.prior"

@@ -16,7 +16,8 @@ from benchmarks.measure import MIB, Cost, measure
 from gsmap.engine.figures import keep_figures
 from gsmap.engine.launch import read_config
 
-STEPS_IN_A_ROW = 8  # on a GPU; the host waits for the GPU only after the last one
+# Steps per measured call on a GPU. The host waits for the GPU only after the last one.
+STEPS_IN_A_ROW = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,14 +39,16 @@ def run(args: argparse.Namespace) -> None:
     Args:
         args: Parsed options of ``add_arguments``.
     """
-    tasks: list[tuple[str, argparse.Namespace, str]] = []
+    tasks: list[tuple[str, argparse.Namespace, str]] = []  # arguments of `step_cost`
     for path in args.configs:
         is_gsmap = "GSMap" in read_config(path).model.map_head.type
-        rasters = args.rasters if is_gsmap else [""]
+        rasters = args.rasters if is_gsmap else [""]  # other heads have no such raster
         for raster in rasters:
             tasks.append((path, args, raster))
+    # On a CPU, each task runs in a separate process, so that no model uses memory of another one.
     costs = [cost for _path, cost in models.measure_each(step_cost, tasks)]
     device = torch.device(args.device)
+    # Ratios refer to the first config with its first raster.
     first_seconds = costs[0].time_s(device)
     first_peak = costs[0].peak_bytes
     rows = []
@@ -65,7 +68,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
-    """Measure the training step of a config.
+    """Measure the training step of a config; on a GPU, the mean of several steps in a row.
 
     The step is mmengine's, from pixels on the host to new weights, with the optimizer and gradient
     clipping of the config, and the collection of the losses and statistics for the log.
@@ -82,19 +85,22 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     model, inputs, samples = models.model_and_batch(path, args, batch=args.batch, raster=raster)
     model.train()
     wrapper = build_optim_wrapper(model, read_config(path, args.cfg_options).optim_wrapper)
+    # The data preprocessor of the model takes pixels on the host, so the inputs are converted back.
     images = []
-    for normalized in inputs["imgs"]:
+    for normalized in inputs["imgs"]:  # images of one sample (V, 3, H, W)
         pixels = (normalized * 50 + 120).clamp(0, 255)  # undoes the normalization, approximately
         images.append(pixels.to("cpu", torch.uint8))
     batch = [sample.cpu() for sample in samples]
 
     def step() -> None:
         models.advance_samples(batch)  # a temporal model expects the next frame
+        # Copies, because a training step may change its input.
         data = {
             "inputs": {"img": list(images)},
             "data_samples": [sample.clone() for sample in batch],
         }
         figures = model.train_step(data, wrapper)
+        # As in a training, the losses and statistics are added to the histories for the log.
         prefixed = {f"train/{name}": value for name, value in figures.items()}
         keep_figures(wrapper.message_hub, prefixed)
 
@@ -106,5 +112,6 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
         for _ in range(STEPS_IN_A_ROW):
             step()
 
+    # Only the times are divided: the steps run one after another, so the peak memory is of one.
     cost = measure(steps_in_a_row, device, repeats=args.repeats)
     return replace(cost, wall_s=cost.wall_s / STEPS_IN_A_ROW, cpu_s=cost.cpu_s / STEPS_IN_A_ROW)

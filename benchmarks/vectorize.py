@@ -1,4 +1,7 @@
-"""Time to vectorise the maps of a trained model, at their size and at the size of the paper."""
+"""Time to trace lines in the maps that a trained HDMapNet predicts.
+
+It is measured twice: at the size of the predicted maps, and at the size of the maps in the paper.
+"""
 
 import argparse
 import time
@@ -13,7 +16,7 @@ from torch.nn.functional import interpolate
 from benchmarks.measure import markdown_table
 from gsmap.apis.map_inferencer import MapInferencer
 
-FULL_SIZE = (200, 400)  # size of nuScenes' maps in the paper
+FULL_SIZE = (200, 400)  # rows and columns of nuScenes' maps in the paper
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,9 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print the processor time of a frame.
+    """Measure and print the processor time in which the lines of a frame are traced.
 
-    The first frame is left out, because the kernels are compiled during it.
+    The first frame is left out, because numba compiles the functions for tracing during it.
 
     Args:
         args: Parsed options of ``add_arguments``.
@@ -39,32 +42,35 @@ def run(args: argparse.Namespace) -> None:
     inferencer = MapInferencer(args.config, args.checkpoint, device="cpu")
     dataset = inferencer.dataset(args.truth, args.data_root)
     head = inferencer.model.map_head
-    vectorize_maps = head.lines
-    settings = head.vectorizing
+    vectorize_maps = head.lines  # method that traces the lines of the maps of one sample
+    settings = head.vectorizing  # settings that this method reads
     # The defaults of the other settings are the published values, which hold for FULL_SIZE.
     published_settings = type(settings)(degrees=settings.degrees)
     settings_by_size = {head.map_size: settings, FULL_SIZE: published_settings}
     times_ms: dict[tuple[int, ...], list[float]] = {size: [] for size in settings_by_size}
 
     def time_lines(maps: Any) -> object:
-        """Convert maps to lines in every size, record the times, and return the last lines."""
+        """Trace the lines of maps (`LineMaps`) in every size, and record the times.
+
+        The lines of the last size are returned, because the head expects a result. Nothing uses it.
+        """
         for size, size_settings in settings_by_size.items():
             head.vectorizing = size_settings
             resized_values = [resize_map(values, size) for values in maps]
-            resized = type(maps)._make(resized_values)  # a NamedTuple
+            resized_maps = type(maps)._make(resized_values)  # `LineMaps` is a NamedTuple
             start = time.process_time()
-            lines = vectorize_maps(resized)
+            lines = vectorize_maps(resized_maps)
             elapsed_s = time.process_time() - start
             times_ms[size].append(1000 * elapsed_s)
         return lines
 
     head.lines = time_lines  # replaces the method, which `vectorize_maps` still refers to
-    rows_to_predict = range(min(args.samples + 1, len(dataset)))
+    rows_to_predict = range(min(args.samples + 1, len(dataset)))  # one more, for the first frame
     for _ in inferencer.predict(dataset, rows_to_predict):
-        pass
+        pass  # each prediction calls `time_lines`
     table = []
     for (height, width), frame_times in times_ms.items():
-        times = frame_times[1:]
+        times = frame_times[1:]  # without the first frame
         row = [
             f"{height} x {width}",
             len(times),

@@ -28,7 +28,7 @@ CAMERAS = {"CAM_FRONT": "/front", "CAM_BACK": "/rear"}
 VEHICLE = "base_footprint"  # x ahead, y left, on the road below the rear axle
 MIN_SCORE = 0.3
 PERIOD_S = 0.5
-# RGB of the classes divider, ped_crossing and boundary.
+# RGB of the classes divider, ped_crossing and boundary, in the order of the model's labels.
 COLOURS = [(0.2, 0.6, 1.0), (1.0, 0.6, 0.1), (0.2, 0.8, 0.3)]
 
 
@@ -39,10 +39,11 @@ class MapNode(Node):
         super().__init__("gsmap")
         self.inferencer = MapInferencer(MODEL)
         self.live = None  # function from images to map elements, made once the cameras are known
-        self.images = {}
-        self.infos = {}
+        self.images = {}  # latest Image message of each camera, by the name of the camera
+        self.infos = {}  # latest CameraInfo message of each camera
         for name, topic in CAMERAS.items():
-            # Store the latest message of each topic by the name of its camera.
+            # Each message replaces the previous one of its camera. The last argument of a
+            # subscription, 1, is the length of the queue: older images are dropped.
             keep_image = partial(self.images.__setitem__, name)
             keep_info = partial(self.infos.__setitem__, name)
             self.create_subscription(Image, f"{topic}/image_rect", keep_image, 1)
@@ -55,9 +56,14 @@ class MapNode(Node):
     def cam_from_vehicle(self, info: Any) -> np.ndarray:
         """Transform from the vehicle to a camera, in metres. (4, 4)
 
-        An error is raised if tf has no such transform.
+        tf raises an error if it has no such transform.
+
+        Args:
+            info: CameraInfo message, whose header names the frame of the camera.
         """
         camera = info.header.frame_id
+        # tf returns the transform from the second frame to the first one. `Time()` is the time 0,
+        # which asks for the latest transform.
         transform = self.transforms.lookup_transform(camera, VEHICLE, Time()).transform
         turn = transform.rotation
         shift = transform.translation
@@ -72,7 +78,8 @@ class MapNode(Node):
             intrinsics = {}
             mounting = {}
             for name, info in self.infos.items():
-                projection = np.reshape(info.p, (3, 4))  # of the rectified image
+                # `p` belongs to the rectified image, and `k` to the image before rectification.
+                projection = np.reshape(info.p, (3, 4))
                 intrinsics[name] = projection[:, :3]
                 mounting[name] = self.cam_from_vehicle(info)
             # The frame "vehicle" of the library has the axes and the origin of VEHICLE. CAMERAS may
@@ -82,7 +89,9 @@ class MapNode(Node):
             )
         elements = self.live({name: rgb(message) for name, message in self.images.items()})
         confident = elements.select(elements.confidence > MIN_SCORE)
+        # The images may have slightly different times. The time of one of them stands for all.
         stamp = next(iter(self.images.values())).header.stamp
+        # A viewer keeps old markers until they are erased.
         erase = Marker(action=Marker.DELETEALL)
         self.publisher.publish(MarkerArray(markers=[erase, *markers(confident, stamp)]))
 
@@ -96,7 +105,12 @@ def rgb(message: Any) -> np.ndarray:
 
 
 def markers(elements: MapElements, stamp: Any) -> Iterator[Any]:
-    """A line for each element, in the vehicle's frame."""
+    """Yield a line marker for each element, in the vehicle's frame.
+
+    Args:
+        elements: Map elements in the frame of the vehicle, in metres.
+        stamp: Time of the images.
+    """
     for number, (line, label) in enumerate(zip(elements.polylines, elements.labels, strict=True)):
         marker = Marker(id=number, type=Marker.LINE_STRIP)
         marker.header.frame_id = VEHICLE

@@ -37,6 +37,7 @@ def parse_args() -> argparse.Namespace:
 
 def main() -> str:
     args = parse_args()
+    # Imported after the options are parsed, because these libraries are slow to import.
     from mmdet3d.registry import DATASETS
 
     from gsmap.apis.map_inferencer import spread_evenly
@@ -45,17 +46,19 @@ def main() -> str:
     from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 
     cfg = read_config(args.config, args.cfg_options)
-    with building(cfg):
+    with building(cfg):  # adds the name of the config and of its part to errors
         dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
     if args.web:
         options = PageOptions(data_root=Path(dataset.data_root), max_frames=args.num)
-        return write_page(args.web, page_data(dataset.ann_file, {}, options))  # no results
+        # The page has no results ({}), only ground truth and images. A summary is returned.
+        return write_page(args.web, page_data(dataset.ann_file, {}, options))
     visualizer = MapVisualizer("browse", show_order=args.order)
     visualizer.dataset_meta = dataset.metainfo
     indices = spread_evenly(len(dataset), args.num)
     for index in Progress(indices, unit="pictures"):
         item = dataset[index]
         sample = item["data_samples"]
+        # For None, `draw_sample` reads the original image files.
         images = None if args.original else images_from_inputs(item["inputs"]["img"])
         figure = visualizer.draw_sample(sample, images)
         save_figure(figure, args.show_dir / sample_name(sample.metainfo, f".{args.format}"))

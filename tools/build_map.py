@@ -57,13 +57,13 @@ from gsmap.visualization.figure import save_figure
 from gsmap.visualization.style import MapStyle
 
 FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
-_LON_LAT = "_lonlat"  # the name of a map in degrees ends in this
+_LON_LAT = "_lonlat"  # ending of the names of GeoJSON files in degrees; other ones are in metres
 _SCORES = "scores.json"
 _CHANGES = "changes"  # name of the file of changes, without a suffix
 # Bytes that every output of this command contains. A file without them belongs to another program.
 _MARK = b"gsmap"  # in maps
 _MARK_OF_SCORES = b'"merged"'  # in scores
-# Package and extra that a format needs.
+# Package that a format needs, and the extra of GSMap that installs it (`pip install -e .[viz]`).
 EXTRAS = {"rrd": ("rerun", "viz"), "mcap": ("foxglove", "viz"), "mp4": ("av", "viz")}
 
 
@@ -205,22 +205,24 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
     """Check, before the first file is written, that the formats have their packages and an origin.
 
     Raises:
-        ImportError: If a package is missing.
+        RuntimeError: If a package is missing.
         ValueError: If an option is out of range, options exclude each other, samples have no poses,
             their positions do not fit the origin, or the origin is unknown and a format needs it.
     """
     if not 0 < args.speed_limit < math.inf:
         raise InputError(f"--speed-limit must be > 0, got {args.speed_limit}.")
     for key in EXTRAS.keys() & set(args.formats):
-        import_extra(*EXTRAS[key])
+        package, extra = EXTRAS[key]
+        import_extra(package, extra)
     origins = {name: find_origin(args, ann, name) for name in set(ann.column("map_name"))}
     if args.crs and args.origin:
         raise InputError("--crs and --origin both say where the poses lie: give one of them.")
     require_positions(ann, origins.values(), str(args.ann))
-    unknown = []
+    maps_without_origin = []
     for name, origin in sorted(origins.items()):
         if origin is None:
-            unknown.append(name)
+            maps_without_origin.append(name)
+    # Data without poses is marked by this option of the annotation file.
     has_poses = ann.meta.options.get("poses", True)
     needs_poses = args.formats != ["mp4"] or args.prior or args.changes
     if needs_poses and not has_poses:
@@ -228,13 +230,13 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
             f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
             "mp4 shows the single frames."
         )
-    if "osm" in args.formats and unknown:
+    if "osm" in args.formats and maps_without_origin:
         raise InputError(
-            f"Lanelet2 needs longitude and latitude, and the origin of map {unknown[0]!r} is not "
-            "known: give --origin LAT LON (any place will do; nodes keep local_x and local_y), or "
-            "--crs if poses are coordinates of a grid."
+            "Lanelet2 needs longitude and latitude, and the origin of map "
+            f"{maps_without_origin[0]!r} is not known: give --origin LAT LON (any place will do; "
+            "nodes keep local_x and local_y), or --crs if poses are coordinates of a grid."
         )
-    has_known_origin = len(unknown) < len(origins)
+    has_known_origin = len(maps_without_origin) < len(origins)
     if {"osm", "geojson"} & set(args.formats) and has_known_origin:  # degrees are written
         import_extra("pyproj", "maps")
 
@@ -253,7 +255,7 @@ def require_positions(
         ValueError: If positions are far from an origin, or outside of a grid.
     """
     positions = np.array([sample.global_from_frame[:2, 3] for sample in ann])
-    for origin in set(origins):
+    for origin in set(origins):  # several maps may have one origin
         if isinstance(origin, MapOrigin):
             require_near(positions, where)
         elif isinstance(origin, MapGrid):
@@ -265,7 +267,7 @@ def require_own_files(args: argparse.Namespace, names: Iterable[str], scored: bo
 
     Args:
         args: The options of the command.
-        names: Name of the files of each drive, without a suffix.
+        names: Name of the files of each map, without a suffix.
         scored: Whether the maps are scored.
 
     Raises:
@@ -292,6 +294,9 @@ def find_origin(
     args: argparse.Namespace, ann: AnnotationFile, map_name: str
 ) -> MapOrigin | MapGrid | None:
     """Place of the global frame on the earth, or None if it is unknown.
+
+    The place is the latitude and longitude of the origin (`MapOrigin`), or the grid in which the
+    poses are coordinates (`MapGrid`).
 
     Args:
         args: The options of the command; ``--crs`` and ``--origin`` have priority.
@@ -326,6 +331,7 @@ def write_map(
     style = MapStyle(classes)
     root = args.data_root or args.ann.parent
     colours = [style.colour(label) for label in range(len(classes))]
+    # Frames, images and the map, for the formats that show the drive over time.
     replay = Replay(
         drive,
         elements,
@@ -378,6 +384,7 @@ def draw(
         ann: The samples.
         style: Colours and titles of the classes.
     """
+    # The baseline selects predictions of the frames by non-maximum suppression.
     maps = {"suppressed (baseline)": suppress(drive), "merged": merged}
     if has_truth(ann):
         maps["true"] = true_map(read_drive(ann, drive.scenes, read_truth(ann)))
@@ -408,7 +415,7 @@ def score(passes: list[Pass], ann: AnnotationFile, out: Path) -> None:
     merged = []
     truths = []
     baseline = []
-    for one_pass in passes:
+    for one_pass in passes:  # a `Pass` has a drive and its map (`elements`)
         drive = one_pass.drive
         drives.append(drive)
         merged.append(one_pass.elements)
@@ -472,15 +479,15 @@ def compare(
         passes: The drives with their merged maps.
     """
     drive = passes[0].drive
-    found = find_changes(old, passes, merge_config(args))
+    comparison = find_changes(old, passes, merge_config(args))
     path = args.out / f"{_CHANGES}.geojson"
     place = drive.frames[0].sample.map_name
-    write_changes(path, found.changes, drive.classes, place=place)
+    write_changes(path, comparison.changes, drive.classes, place=place)
     origin = find_origin(args, ann, place)
     if origin is not None:
         lon_lat_path = args.out / f"{_CHANGES}{_LON_LAT}.geojson"
-        write_changes(lon_lat_path, found.changes, drive.classes, place=place, origin=origin)
-    print(f"changes: {summarize_changes(found)}: {path}")
+        write_changes(lon_lat_path, comparison.changes, drive.classes, place=place, origin=origin)
+    print(f"changes: {summarize_changes(comparison)}: {path}")
 
 
 def write_prior(path: Path, place: str, classes: Sequence[str], maps: list[MapElements]) -> None:
@@ -601,7 +608,8 @@ def read_results(args: argparse.Namespace, ann: AnnotationFile) -> dict[str, Map
     """Read the predictions in the annotation frames of the samples, by token.
 
     Raises:
-        ValueError: If maps are scored, and the model was trained on another split.
+        ValueError: If the file is malformed, or if maps are scored and the model was trained on
+            another split.
     """
     file = SampleFile(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
     results = {token: elements for token, elements, _ in file}
@@ -626,25 +634,31 @@ def merge_drives(
 
     Returns:
         Drives with their merged maps, and the processor time of merging in seconds.
+
+    Raises:
+        ValueError: If a map has the file name of the changes, an output would replace another
+            program's file, or a drive has no results.
     """
     has_poses = ann.meta.options.get("poses", True)
     # `file_names` gives each drive a safe file name. The names are chosen for all drives of the
-    # annotation file, so that a drive has the same name when other drives are selected.
+    # annotation file, so that the name of a drive does not depend on the selected drives. They
+    # stay different when "_lonlat" is appended to some of them.
     all_names = ann.column("map_name" if args.join else "scene")
     names = file_names(sorted({*all_names, *groups}), ("", _LON_LAT))
     if args.out:
-        own_names = [names[name] for name in groups]
-        if args.changes and _CHANGES in own_names:
+        chosen_names = [names[name] for name in groups]
+        if args.changes and _CHANGES in chosen_names:
             raise InputError(
                 f"drive {_CHANGES!r} has the name of the file that --changes writes: leave "
                 "--changes out, or choose other drives with --scene."
             )
-        require_own_files(args, names=own_names, scored=has_truth(ann))
+        require_own_files(args, names=chosen_names, scored=has_truth(ann))
     passes = []
     processor_s = 0.0
     for name, scenes in groups.items():
         drive = confident(read_drive(ann, scenes, results, name), args.score_thr)
         start_s = time.process_time()
+        # Without poses there is no map; the video shows the single frames.
         elements = merge(drive, merge_config(args)) if has_poses else MapElements.from_polylines()
         processor_s += time.process_time() - start_s
         passes.append(Pass(drive, elements))
@@ -657,16 +671,18 @@ def merge_drives(
 
 
 def main(argv: list[str] | None = None) -> str:
+    """Run the command, and return the line that it prints at its end."""
     args = parse_args(argv)
     ann = AnnotationFile(args.ann)
     scenes = args.scene or sorted(set(ann.column("scene")))
     check_options(args, ann)
     place = place_of(ann, scenes) if args.changes or args.prior else ""
     old = open_map(args.changes, args, ann, place) if args.changes else None
+    # Maps for the prior: the map of --map, and the map of each drive.
     maps = [open_map(args.map, args, ann, place)] if args.map else []
     passes: list[Pass] = []
     results: dict[str, MapElements] = {}
-    summary = f"a prior of {place}"
+    summary = f"a prior of {place}"  # without results, the prior is the only output
     if args.results:
         results = read_results(args, ann)
         groups = group_scenes(args, ann, scenes)

@@ -61,12 +61,12 @@ from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import digest, digest_of_common, read_shard
 from gsmap.utils.words import format_count
 
-# Reports that `print_reports` skips, because the code that makes them also prints them.
+# Names of reports that `print_reports` skips, because the code that makes them also prints them.
 PRINTED = ("intervals", "by", "uncertainty", "changes")
 
 
 class TruthSettings(NamedTuple):
-    """Settings that a ground-truth file describes.
+    """Classes and extent of the ground truth, as described in its file.
 
     Attributes:
         classes: Names of the classes, in label order.
@@ -87,12 +87,16 @@ def json_settings(path: Path) -> TruthSettings:
     Args:
         path: Ground-truth file in JSON, for example written by ``create_data.py export``.
 
+    Returns:
+        Classes and range of the ground truth.
+
     Raises:
         FileNotFoundError: If the file does not exist.
         ValueError: If the file has no ground truth, or its classes or its range are malformed.
     """
     meta = read_leading_meta(path, GROUND_TRUTH_KEY)
     x_range, y_range = RANGES["lidar"]
+    # Errors about the content begin with the first text and end with the second one.
     with explain_errors(f"meta of {path}", "correct it, or remove it"):
         classes = meta.get("classes", CLASSES)
         if not isinstance(classes, (list, tuple)) or not all(isinstance(c, str) for c in classes):
@@ -140,7 +144,7 @@ def build_evaluator(args: argparse.Namespace, settings: MetricSettings) -> MapEv
     Raises:
         ValueError: If a metric is unknown, or no chosen metric can use one of the options.
     """
-    for module in args.custom_imports:
+    for module in args.custom_imports:  # modules that register further metrics
         import_module(module)
     evaluator = MapEvaluator.from_names(args.eval, settings, args.gt_points)
     uses_min_score = any(metric.takes_min_score for metric in evaluator.metrics)
@@ -203,12 +207,17 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
 
     Returns:
         A line with the number of samples and the file.
+
+    Raises:
+        FileNotFoundError: If the results do not exist.
+        ValueError: If a file is malformed, or another program's file has the name of the output.
     """
     require_own_matches(args.out, args.shard)
     # The results are in one file for all shards, or in a file for this shard. If neither exists,
     # `digest` raises an error that names the first one.
     results = args.results
     results_shard = args.shard.path_of(args.results)
+    # The source identifies the inputs. It must be equal for all shards of one evaluation.
     if args.results.exists() or not results_shard.exists():
         source = digest(args.results)
     else:
@@ -216,6 +225,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
         source = digest_of_common(read_shard(results_shard))
     pairs = open_pairs(args, results, classes=evaluator.classes)
     matches = list(match_samples(pairs, evaluator, args.workers))
+    # Notes on ignored elements are complete only after all pairs were matched.
     notes = pairs.notes(evaluator.counts_heights, evaluator.canvas)
     source += digest(args.ground_truth)
     path = write_matches(
@@ -256,8 +266,9 @@ def print_reports(reports: list[MetricReport], notes: list[str], args: argparse.
 
 
 def main(argv: list[str] | None = None) -> str:
+    """Run the command, and return its last line, which `run_command` prints."""
     args = parse_args(__doc__, argv)
-    if args.executor:
+    if args.executor:  # a Ray cluster runs this command once for each shard
         return run_on_ray(args, sys.argv)
     start = time.perf_counter()
     if args.changes:
@@ -265,11 +276,11 @@ def main(argv: list[str] | None = None) -> str:
         return f"{args.results} in {time.perf_counter() - start:.1f} s"
     settings = metric_settings(args)
     evaluator = build_evaluator(args, settings)
-    if args.shard.count:
+    if args.shard.count:  # 0 without ``--shard``
         return match_shard(args, evaluator, settings)
     # These files are read first, so that errors in them end the command before the scoring.
     groups = read_groups(args)
-    resamples = read_resamples(args)
+    resamples = read_resamples(args)  # random samples of the scenes; None without an interval
     reports, notes = evaluate_input(args, evaluator)
     ranked = []  # reports of metrics with an AP
     unranked = []
@@ -280,6 +291,7 @@ def main(argv: list[str] | None = None) -> str:
             unranked.append(report)
     analyses = []
     if resamples is not None:
+        # The notes of the other file are appended to `notes`, which are printed at the end.
         others = evaluate_results(args.against, args, evaluator) if args.against else None
         analyses.append(interval_report((ranked, notes), others, resamples, args))
     if args.by:

@@ -51,7 +51,7 @@ if TYPE_CHECKING:  # slow to import
 
 _ONE_SAMPLE_HZ = 1e-4  # at this rate, only one sample of each drive is read
 _SAMPLES_SUFFIX = ".arrow"  # the annotation file of the samples is named like --out, but with this
-SKIPPED = 1  # exit code after broken frames
+SKIPPED = 1  # exit code after broken frames, which are samples with a missing or damaged file
 IMPLAUSIBLE = 1  # exit code for an implausible calibration
 
 
@@ -175,7 +175,12 @@ def _add_picture_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _trained_cameras(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
-    """Cameras that the model was trained with, by name; empty if the checkpoint lacks them."""
+    """Cameras that the model was trained with, by name.
+
+    Returns:
+        Width, height, fx, fy, cx and cy in pixels for each camera. Empty without ``--model``, or if
+        the checkpoint lacks them.
+    """
     if not args.model:
         return {}
     from gsmap.apis.loading import trained_rig
@@ -195,9 +200,12 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
 
     Args:
         args: The options of the command.
-        frames: Folder for images that the reader writes. If it is given, a single sample of each
-            drive is read. If it is None, all samples are read, and images are written to a folder
-            beside the output.
+        frames: Folder for images that the reader writes, such as the images of a bag. If it is
+            given, a single sample of each drive is read. If it is None, samples are read at
+            ``--rate``, and images are written to a folder beside the output.
+
+    Returns:
+        The samples of the input, in an `AnnotationFile` if the input is one.
 
     Raises:
         ValueError: If the input is not a recording.
@@ -207,6 +215,7 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
         rate_hz = args.rate
         stem_without_out = (args.show_dir or Path()) / "input"
         stem = args.out.with_suffix("") if args.out else stem_without_out
+        # A registered folder must not contain links that would lead files out of it.
         frames = register_folder(stem.with_name(f"{stem.name}_frames"))
     options = InputOptions(
         data_root=args.data_root,
@@ -218,7 +227,7 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
         vehicle_ground_z_m=args.vehicle_ground_z,
         topics=parse_topics(args.topics),
         calibration=args.calibration,
-        trained=_trained_cameras(args),
+        trained=_trained_cameras(args),  # images of distorted cameras are rectified to these
     )
     source = open_input(args.input, options)
     for note in source.notes:
@@ -302,9 +311,11 @@ def result_header(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, A
     path = chosen_checkpoint(args)
     checkpoint = read_checked(path)
     header = {"classes": list(data["classes"]), CHECKPOINT: digest(path)}
+    # The calibration relates the sizes of predicted Gaussians to the errors of their positions.
     optional: dict[str, Any] = {CALIBRATION: checkpoint.calibration}
-    if identity := data.get(SPLIT_LIST):
-        optional[SPLIT_LIST] = identity
+    # Lists by which scenes were split: of these samples, and of the training data of the model.
+    if split_list := data.get(SPLIT_LIST):
+        optional[SPLIT_LIST] = split_list
         optional[TRAINED_ON] = checkpoint.list_of(data["dataset"])
     for key, value in optional.items():
         if value:
@@ -330,6 +341,8 @@ def open_log(
     classes: Sequence[str],
 ) -> AbstractContextManager[ResultLog | None]:
     """Open the log of the predictions of this run. Without ``--out``, the context returns None.
+
+    The log is a file beside ``--out`` with one line per sample. An interrupted run goes on from it.
 
     Args:
         args: The options of the command.
@@ -366,6 +379,7 @@ def predict(
     """
     tokens = dataset.annotations.column("token")
     broken: dict[str, str] = {}
+    # Samples of an earlier run, predicted or broken. A copy, because the log adds to its set.
     done = set(results.done) if results else set()
     with Progress(total=len(chosen), unit="samples", smoothing=0.05) as bar:
         if results and results.dropped:
@@ -376,12 +390,14 @@ def predict(
         if results and done:
             bar.write(f"going on after {len(done)} of {format_count(len(chosen), 'sample')}")
             broken.update(results.broken)
-            # A model that uses earlier frames must process all of them again.
+            # A model that uses earlier frames must process all of them again. Their predictions are
+            # not logged a second time.
             if not remembers(inferencer):
                 bar.update(len(done))
                 chosen = [index for index in chosen if tokens[index] not in done]
 
         def skip(frame: "BrokenFrame") -> None:
+            """Record a broken frame, which the model does not predict."""
             broken[frame.token] = frame.reason
             bar.write(f"broken frame skipped: {frame.reason}")
             bar.update()
@@ -457,6 +473,8 @@ def save_priors(args: argparse.Namespace, priors: Sequence["AnyPrior"]) -> None:
 def place_of(dataset: "VectorizedMapDataset", chosen: Sequence[int], path: Path) -> str:
     """Name of the place of samples; the file name without suffix if the place is unknown.
 
+    A prior belongs to one place. A file that is created gets this name.
+
     Args:
         dataset: The samples.
         chosen: Indices of the samples to predict.
@@ -465,7 +483,7 @@ def place_of(dataset: "VectorizedMapDataset", chosen: Sequence[int], path: Path)
     Raises:
         ValueError: If the file does not exist and the samples are in several places.
     """
-    all_names = dataset.annotations.column("map_name")
+    all_names = dataset.annotations.column("map_name")  # empty if unknown
     names = sorted({all_names[index] for index in chosen})
     if len(names) > 1 and not path.exists():
         raise InputError(
@@ -499,8 +517,9 @@ def draw(
 
 
 def main(argv: list[str] | None = None) -> str | None:
+    """Run the command. A returned text is printed by `run_command`."""
     args = parse_args(argv)
-    if args.executor:
+    if args.executor:  # a Ray cluster runs this command once for each shard
         return run_on_ray(args, sys.argv)
     if args.check_calibration:
         with TemporaryDirectory() as frames:
@@ -511,6 +530,8 @@ def main(argv: list[str] | None = None) -> str | None:
     if args.width is not None and args.width < 1:
         raise InputError(f"--width must be >= 1 pixel, got {args.width}.")
     source = read_input(args)
+    # Samples of other inputs are written to an annotation file beside ``--out`` at the end
+    # (`print_summary`), which must not replace a foreign file. Their calibration is checked, too.
     if not isinstance(source.samples, AnnotationFile):
         if args.out:
             require_own_samples(args.out.with_suffix(_SAMPLES_SUFFIX))
@@ -518,13 +539,14 @@ def main(argv: list[str] | None = None) -> str | None:
     from gsmap.apis.map_inferencer import select_samples
 
     inferencer = open_model(args)
-    if args.shard.count and remembers(inferencer):
+    if args.shard.count and remembers(inferencer):  # the count is 0 without ``--shard``
         raise InputError(
             "--shard cuts drives, which a model that uses earlier frames or a prior needs whole: "
             "leave it out."
         )
     dataset = inferencer.dataset(source)
     tokens = dataset.annotations.column("token")
+    # Indices of the samples to predict: the part of this shard, or all without ``--shard``.
     chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))
     settings = run_settings(args)
     samples_digest = digest(dataset.annotations.path)
@@ -543,6 +565,8 @@ def main(argv: list[str] | None = None) -> str | None:
         if chosen and len(broken) == len(chosen):
             raise no_usable_frame(broken, source.notes)
         if results:
+            # Writes the result file. The manifest describes the file of a shard for the command
+            # that merges shards; without ``--shard``, none is written.
             count = results.finish(result_header(args, dataset.metainfo))
             args.shard.write_manifest(
                 args.out,

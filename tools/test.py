@@ -74,13 +74,14 @@ def parse_args() -> argparse.Namespace:
 
 def apply_options(cfg: Config, args: argparse.Namespace) -> None:
     """Apply the options of this command to the config, in place."""
-    cfg.resume = False
+    cfg.resume = False  # only weights are loaded, not the state of a training
     map_metric = {
         "type": "MapMetric",
-        **(cfg.get("test_evaluator") or {}),
+        **(cfg.get("test_evaluator") or {}),  # settings of the config
         "eval": args.eval,
         "out_file": str(args.out) if args.out else None,
     }
+    # `GaussianMetric` adds statistics of predicted Gaussians.
     cfg.test_evaluator = [map_metric, {"type": "GaussianMetric"}]
     if args.allow_other_split:
         cfg.default_hooks.checkpoint.allow_other_split = True
@@ -108,14 +109,17 @@ def main() -> None:
 
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     cfg = load_config(args)
+    # The model gets the settings with which the checkpoint was trained. Notes name the changes.
     notes = adopt_settings(cfg, checkpoint, args.cfg_options)
     cfg.load_from = str(checkpoint)
     apply_options(cfg, args)
-    if notes and is_first_rank():
+    if notes and is_first_rank():  # one of several processes prints
         print("\n".join(notes))
+    # `building` adds the names of the config's parts to errors. The stack closes the priors.
     with building(cfg), ExitStack() as stack:
         runner = MapRunner.from_cfg(cfg)
         if args.prior:
+            # In a distributed test, the model is within a wrapper.
             model = runner.model.module if is_model_wrapper(runner.model) else runner.model
             use_priors(model, args.prior, stack)
         metrics = runner.test()

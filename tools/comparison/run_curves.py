@@ -19,7 +19,8 @@ from gsmap.utils.files import read_text
 from gsmap.visualization.plots import finish_panel, finish_shares, panel_grid
 from gsmap.visualization.style import RUN_COLOURS, MapStyle
 
-# Keys of records that are not metrics.
+# A record is one line of a log: the scalars that were logged at one step. Keys of records that are
+# not metrics:
 _TIMING = ("data_time", "time", "step", "epoch", "iter", "memory")
 
 
@@ -38,7 +39,15 @@ class RunLog:
     val: Sequence[Mapping[str, float]]
 
     def series(self, key: str, validation: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Steps and finite values of one scalar, both (n,)."""
+        """Steps and finite values of one scalar.
+
+        Args:
+            key: Name of the scalar.
+            validation: Whether to read the records of validation instead of training.
+
+        Returns:
+            Steps and values; records without a finite value are left out. (n,) each
+        """
         records = self.val if validation else self.train
         steps = []
         values = []
@@ -56,7 +65,8 @@ class RunLog:
         for key in logged_keys(self.val):
             if key not in _TIMING:
                 names.append(key)
-        return [name for name in names if "map" in name.lower()] or names
+        mean_names = [name for name in names if "map" in name.lower()]
+        return mean_names or names
 
 
 def logged_keys(records: Iterable[Mapping[str, float]]) -> list[str]:
@@ -83,7 +93,7 @@ def _records(path: Path) -> list[dict[str, float]]:
             records.append(scalars)
         # An `InputError` is a ValueError. A number beyond the range of float is an OverflowError.
         except (ValueError, OverflowError) as error:
-            if number == len(lines):
+            if number == len(lines):  # the unfinished last line
                 break
             raise InputError(f"{path}, line {number} is not JSON: {error}.") from error
     return [record for record in records if "step" in record]
@@ -140,7 +150,8 @@ def smooth(values: np.ndarray) -> np.ndarray:
 
 def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, title: str) -> None:
     """Draw a scalar of training for each run: all values faintly, and a smoothed curve."""
-    # Here and below, colours are repeated in case there are more curves than colours.
+    # Here and below, colours are repeated in case there are more curves than colours. The longer
+    # list of colours is cut by `zip`.
     for run, colour in zip(runs, RUN_COLOURS * len(runs), strict=False):
         steps, values = run.series(key)
         ax.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
@@ -149,7 +160,7 @@ def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, title: str) -> No
 
 
 def _draw_parts_of_loss(ax: Axes, run: RunLog) -> None:
-    """Draw the loss terms of the last decoder layer, which have no prefix such as d0."""
+    """Draw the loss terms of the last decoder layer, which have no prefix such as ``d0.``."""
     last_layer = []
     for key in logged_keys(run.train):
         is_term = "loss" in key and key != "loss"
@@ -180,14 +191,14 @@ def _finish(ax: Axes, title: str, x_label: str = "iteration") -> None:
     The y axis is logarithmic if the values span more than a factor of ten.
     """
     curves = [np.asarray(line.get_ydata()) for line in ax.lines]
-    values = np.concatenate([np.empty(0), *curves])
+    values = np.concatenate([np.empty(0), *curves])  # the empty array is for panels without curves
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
         ax.set_yscale("log")
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         ax.yaxis.set_major_formatter("{x:g}")
         ax.yaxis.set_minor_formatter(NullFormatter())
     elif len(values) and values.min() >= 0:
-        ax.set_ylim(0, 1.08 * (values.max() or 1.0))
+        ax.set_ylim(0, 1.08 * (values.max() or 1.0))  # up to 1.08 if all values are 0
     finish_panel(ax, title, x_label, legend={"loc": "upper left", "bbox_to_anchor": (1, 1)})
 
 
@@ -248,22 +259,25 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
     Args:
         reports: For each config by its name, the reports of one run, one report per metric.
     """
-    first = next(iter(reports.values()))
-    style = MapStyle(tuple(first[0].detections))
-    figure, axes = panel_grid(len(first), len(style.classes))
-    for index, row in enumerate(axes):
-        unit = " m" if first[index].name == "chamfer" else " IoU"
-        for label, (name, detections) in enumerate(first[index].detections.items()):
+    # All configs have the metrics and the classes of the first one.
+    first_reports = next(iter(reports.values()))
+    style = MapStyle(tuple(first_reports[0].detections))
+    figure, axes = panel_grid(len(first_reports), len(style.classes))
+    for index, row in enumerate(axes):  # index of the metric
+        unit = " m" if first_reports[index].name == "chamfer" else " IoU"
+        # The detections of a class are its predictions over all samples, by descending score.
+        for label, (name, detections) in enumerate(first_reports[index].detections.items()):
             panel = row[label]
             middle = len(detections.thresholds) // 2
-            for report, colour in zip(reports.values(), RUN_COLOURS * 9, strict=False):
-                ranked = report[index].detections[name]
+            for run_reports, colour in zip(reports.values(), RUN_COLOURS * 9, strict=False):
+                ranked = run_reports[index].detections[name]
+                # Whether each prediction is a match at the middle threshold.
                 recall, precision = precision_recall(ranked.hits[:, middle], ranked.num_gts)
                 panel.plot(recall, precision, color=colour, linewidth=1.3)
             if not detections.num_gts:
                 panel.text(0.5, 0.5, "no ground truth", ha="center", fontsize=8)
             title = f"{style.title(label)}, {detections.thresholds[middle]:g}{unit}"
-            y_label = "" if label else "precision"
+            y_label = "" if label else "precision"  # only at the first panel of the row
             finish_shares(panel, title, "recall", y_label, style.colour(label))
     figure.legend(
         axes[0, 0].lines,
@@ -277,7 +291,10 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
 
 
 def summary_table(runs: Sequence[RunLog]) -> str:
-    """Markdown table of runs: length, loss, speed, last and best value of each metric."""
+    """Markdown table of runs: length, loss, speed, last and best value of each metric.
+
+    The best value is the largest one. A value that a run has not logged is ``-``.
+    """
     names: list[str] = []
     for run in runs:
         names += [name for name in run.metrics if name not in names]

@@ -27,10 +27,13 @@ def write_geojson(
 
     Args:
         path: File to write.
-        elements: Map in the global frame.
+        elements: Map in the global frame, in metres. The property ``score`` of an element without a
+            score is 1.
         classes: Class names in label order.
-        origin: Position of the global frame on the Earth. Without one, coordinates are metres of
-            the global frame, and the file has no coordinate reference system (``"crs": null``).
+        origin: Position of the global frame on the Earth: the latitude and longitude of its origin
+            (`MapOrigin`), or the grid, such as UTM, of its coordinates (`MapGrid`). With None,
+            coordinates are metres of the global frame, and the file has no coordinate reference
+            system (``"crs": null``).
 
     Raises:
         RuntimeError: If an origin is given and ``pyproj`` is missing.
@@ -52,7 +55,8 @@ def write_features(
         path: File to write.
         features: Vertices in metres in the global frame, (n, >= 2), and properties of each element.
             The property ``class`` is required. Closed elements of area classes become polygons.
-        origin: Position of the global frame on the Earth, or None for metres.
+        origin: Position of the global frame on the Earth, or None for metres, as in
+            `write_geojson`.
 
     Raises:
         RuntimeError: If an origin is given and ``pyproj`` is missing.
@@ -62,16 +66,19 @@ def write_features(
         if origin is None:
             points = line.round(4).tolist()  # a tenth of a millimetre
         else:
-            points = origin.lon_lat(line).round(9).tolist()  # a tenth of a millimetre
+            # Longitude and latitude in degrees; 1e-9 degrees are a tenth of a millimetre.
+            points = origin.lon_lat(line).round(9).tolist()
         is_area = properties["class"] in AREA_CLASSES and points[0] == points[-1]
         if is_area and not shapely.is_ccw(shapely.LineString(line)):
             points.reverse()  # RFC 7946 asks for anticlockwise outer rings
+        # GeoJSON stores a polygon as a list of rings: the outer ring, then its holes.
         geometry = {
             "type": "Polygon" if is_area else "LineString",
             "coordinates": [points] if is_area else points,
         }
         entries.append({"type": "Feature", "properties": properties, "geometry": geometry})
     crs = None if origin is None else _CRS84
+    # `tools/build_map.py` recognises its files by the word "gsmap" near their beginning.
     collection: dict[str, Any] = {"type": "FeatureCollection", "generator": "gsmap", "crs": crs}
     if origin is None:
         collection["frame"] = "global frame of the poses, metres"

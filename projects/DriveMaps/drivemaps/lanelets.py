@@ -30,10 +30,12 @@ HALF_WIDTH_M = 1.75
 """Distance in metres of a bound from the centre line if there is no border on that side."""
 _MOST_HALF_WIDTH_M = 3.0  # a border farther away belongs to another lane
 _MIN_HALF_WIDTH_M = 0.5
-_JOIN_M = 1.0  # ends within this distance are one node of the lane graph
-_SHORTEST_M = 2.0  # lanes are not split closer than this to an end or to another split
+# Within this distance, ends are one node of the lane graph, and lines lie on top of each other.
+_JOIN_M = 1.0
+# Lines that are not longer are dropped. A line is not split closer to an end or another split.
+_SHORTEST_M = 2.0
 _MIN_SUCCESSOR_COSINE = 0.5  # smallest cosine between the directions of successive lanes
-_MIN_PARALLEL_COSINE = 0.7  # smallest |cosine| between a line and a piece that runs along it
+_MIN_PARALLEL_COSINE = 0.7  # smallest |cosine| between a map line and a frame's line along it
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,8 @@ def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
     The lines of a map that was merged from frames have no direction of travel, but the centre lines
     of the frames have one. Each centre line of the map gets the direction of most of the frames'
     centre lines along it. In a map without centre lines, lanelets are the lanes that the vehicle
-    has driven (`driven_lanes`).
+    has driven (`driven_lanes`). The text `LaneGraph.source` then contains the length of the track
+    that lies in no lane.
 
     Args:
         drive: Frames with poses, and with centre lines in the direction of travel if there are any.
@@ -94,10 +97,10 @@ def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
         lanes = driven_lanes(positions, borders)
         source = f"of driven lanes ({lanes.outside_m:.0f} of {lanes.driven_m:.0f} m are in no lane)"
         return replace(lane_graph(lanes.centerlines, borders), source=source)
-    pieces: list[FloatArray] = []
+    directed_lines: list[FloatArray] = []
     for frame in drive.frames:
-        pieces += _lines_of_class(drive, frame.elements, CENTERLINE)
-    return lane_graph(_orient_lines(lines, pieces), borders)
+        directed_lines += _lines_of_class(drive, frame.elements, CENTERLINE)
+    return lane_graph(_orient_lines(lines, directed_lines), borders)
 
 
 def _lines_of_class(drive: Drive, elements: MapElements, name: str) -> list[FloatArray]:
@@ -123,6 +126,7 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
         Lanelets and nodes.
     """
     nonempty = []
+    # Repeated vertices are dropped, because a line has no direction at them.
     for centerline in centerlines:
         vertices = drop_repeats(np.asarray(centerline)[:, :2])
         if len(vertices) > 1:
@@ -155,10 +159,12 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
         exit_node = int(nodes.node_of_end[2 * index + 1])
         lane = shapely.LineString(line)
         # Lanes between two nodes that lie on top of each other are one lane.
+        # They are compared by their Hausdorff distance, the largest distance of one to the other.
         known_lanes = lanes_between.setdefault((entry_node, exit_node), [])
         if any(shapely.hausdorff_distance(lane, known) <= _JOIN_M for known in known_lanes):
             continue
         known_lanes.append(lane)
+        # Both ends of a bound are points of the nodes, so a lanelet stores the vertices between.
         inner = line[1:-1]
         to_left = rotate_to_left(directions[index])[1:-1]
         left_m, right_m = half_widths[index]
@@ -188,8 +194,9 @@ class _Nodes:
         pairs = cKDTree(ends).query_pairs(_JOIN_M, output_type="ndarray")
         first, second = pairs.T
         cosines = (directions[first] * directions[second]).sum(axis=1)
-        agree = cosines > _MIN_SUCCESSOR_COSINE
-        groups = components(len(ends), first[agree], second[agree])
+        is_joined = cosines > _MIN_SUCCESSOR_COSINE
+        # Ends that are connected by such pairs form a group. An end without a pair is a group, too.
+        groups = components(len(ends), first[is_joined], second[is_joined])
         self.node_of_end = np.empty(len(ends), np.int64)
         self.left = np.empty((len(groups), 2))
         self.right = np.empty((len(groups), 2))
@@ -203,24 +210,35 @@ class _Nodes:
             self.right[node] = middle - right_m * to_left
 
 
-def _orient_lines(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> list[FloatArray]:
-    """Reverse the lines along which most pieces run in the opposite direction. each (n, 2)"""
-    piece_points = []
-    piece_directions = []
-    for piece in pieces:
-        if len(piece) > 1:
-            points = resample(piece[:, :2])
-            piece_points.append(points)
-            piece_directions.append(line_directions(points))
-    if not piece_points:
+def _orient_lines(
+    lines: Sequence[FloatArray], directed_lines: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Reverse the lines along which most directed lines run in the opposite direction.
+
+    Args:
+        lines: Lines of the map in metres, without a direction of travel. each (n, 2)
+        directed_lines: Lines of the frames in the direction of travel, in metres. each (n, 2)
+
+    Returns:
+        The lines of the map in the direction of travel. each (n, 2)
+    """
+    directed_points = []
+    point_directions = []
+    for directed_line in directed_lines:
+        if len(directed_line) > 1:
+            points = resample(directed_line[:, :2])
+            directed_points.append(points)
+            point_directions.append(line_directions(points))
+    if not directed_points:
         return list(lines)
-    tree = cKDTree(np.concatenate(piece_points))
-    directions = np.concatenate(piece_directions)
+    tree = cKDTree(np.concatenate(directed_points))
+    directions = np.concatenate(point_directions)
     oriented = []
     for line in lines:
         samples = resample(line[:, :2])
         _, neighbours = tree.query(samples, k=8, distance_upper_bound=_JOIN_M)
-        # A missing neighbour has the index `len(directions)`.
+        # Each sample has up to eight neighbours, as several frames detect a line. A missing
+        # neighbour has the index `len(directions)`.
         rows, columns = np.nonzero(neighbours < len(directions))
         neighbour_directions = directions[neighbours[rows, columns]]
         cosines = (line_directions(samples)[rows] * neighbour_directions).sum(axis=1)
@@ -256,8 +274,10 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
         shape = shapely.LineString(line)
         cuts = [0.0, shape.length]  # positions along the line in metres
         near_ends = tree.query(shape, predicate="dwithin", distance=_JOIN_M)
+        # A cut excludes later cuts close to it, so the order of the ends counts. It is sorted, as
+        # the tree returns the ends in any order.
         for end in sorted(near_ends.tolist()):
-            if end // 2 == index:  # line i has the ends 2 i and 2 i + 1
+            if end // 2 == index:  # an end of the line itself: line i has the ends 2 i and 2 i + 1
                 continue
             cut = shape.project(shapely.Point(ends[end]))
             # Compare the direction of this line around the cut with the direction of the other line
@@ -281,12 +301,14 @@ def _half_width(line: FloatArray, side: int, borders: shapely.STRtree) -> float:
     Args:
         line: Centre line in metres. (n, 2)
         side: 1 for the left side, -1 for the right side.
-        borders: Dividers and boundaries.
+        borders: Spatial index of dividers and boundaries.
 
     Returns:
-        Distance in metres; ``HALF_WIDTH_M`` if most vertices have no border beside them.
+        Distance in metres, at least 0.5; ``HALF_WIDTH_M`` if most vertices have no border beside
+        them.
     """
     nearest_m = border_distances(line, side, borders=borders, reach_m=_MOST_HALF_WIDTH_M)
+    # The distance is infinite at vertices without a border in reach.
     finite_m = nearest_m[np.isfinite(nearest_m)]
     if 2 * len(finite_m) < len(line):
         return HALF_WIDTH_M

@@ -46,7 +46,7 @@ def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
         config: Parameters of merging; ``MergeConfig()`` by default.
 
     Returns:
-        Lines and closed rings in the global frame, with their confidence as scores.
+        Lines and closed rings in metres in the global frame, with their confidence as scores.
 
     Raises:
         InputError: If the lines are too long or too close together to be merged in bounded time
@@ -57,9 +57,10 @@ def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
     rows = []
     for label, name in enumerate(drive.classes):
         merge_class = merge_areas if name in AREA_CLASSES else merge_lines
+        # Both functions return the merged elements of one class: vertices and confidence of each.
         for points, confidence in merge_class(drive, label, config):
             rows.append((label, points, confidence))
-    return drive_map(rows)
+    return drive_map(rows)  # simplifies and sorts the elements
 
 
 def suppress(drive: Drive) -> MapElements:
@@ -95,6 +96,7 @@ def _without_duplicates(drive: Drive) -> Drive:
     Three kinds of elements are always kept: areas, centre lines (their paths share parts), and
     lines with so many vertices that a comparison would take long.
     """
+    # For each class, whether its elements are always kept.
     may_overlap = np.array([name in (*AREA_CLASSES, CENTERLINE) for name in drive.classes])
     frames = []
     for frame in drive.frames:
@@ -122,15 +124,18 @@ def _select_distinct(elements: MapElements) -> IntArray:
         coordinates = points[:, :2] if len(points) > 1 else None
         lines.append(shapely.LineString(coordinates))
     shapes = np.array(lines, dtype=object)
-    strips = shapely.buffer(shapes, _RADIUS_M)
+    strips = shapely.buffer(shapes, _RADIUS_M)  # area within 1 m of each line
     tree = shapely.STRtree(strips)
+    # From the highest score to the lowest; lines with equal scores keep their order.
     order = np.argsort(-elements.confidence, kind="stable")
     is_selected = np.zeros(len(elements), dtype=bool)
     selected = []
     for index in order.tolist():
         line = shapes[index]
         near = tree.query(line)
-        rivals = near[is_selected[near] & (elements.labels[near] == elements.labels[index])]
+        has_class = elements.labels[near] == elements.labels[index]
+        rivals = near[is_selected[near] & has_class]  # selected lines of the class
+        # Length of the part of the line that runs along each rival.
         lengths_along = shapely.length(shapely.intersection(line, strips[rivals]))
         is_duplicate = (lengths_along > _MOST_SHARE * line.length).any()
         if line.length > 0.0 and not is_duplicate:

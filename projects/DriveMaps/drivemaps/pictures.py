@@ -1,4 +1,4 @@
-"""Pictures of the maps of drives."""
+"""Pictures of maps that were built from drives."""
 
 from collections.abc import Mapping
 
@@ -19,17 +19,23 @@ def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyl
         maps: Maps in the global frame, by title.
         track: Positions of the vehicle in the global frame, in metres. (n, 2)
         style: Colours and titles of the classes.
+
+    Returns:
+        Figure with one panel per map and a common legend. Coordinates begin at the lower left
+        corner of all maps, because global coordinates are large numbers.
     """
     vertices = [elements.points[:, :2] for elements in maps.values()]
     points = np.concatenate([track, *vertices])
-    low = points.min(axis=0) - 5  # a margin of 5 m
+    low = points.min(axis=0) - 5  # lower left corner of all panels, with a margin of 5 m
     high = points.max(axis=0) + 5
-    width, height = high - low
+    width, height = high - low  # metres
     rows = len(maps) if width > 2.5 * height else 1  # one column or one row of panels
-    figure, axes = panel_grid(rows, len(maps) // rows)
-    panel_width = WIDTH_IN * rows / len(maps) - 0.5  # inches, without the labels
-    panel_height = panel_width * min(height / width, 2)
-    figure.set_figheight(0.4 + rows * (panel_height + 0.5))
+    columns = len(maps) // rows
+    figure, axes = panel_grid(rows, columns)
+    panel_width_in = WIDTH_IN * rows / len(maps) - 0.5  # 0.5 inches are for the labels
+    panel_height_in = panel_width_in * min(height / width, 2)  # at most twice as high as wide
+    # 0.4 inches are for the legend, 0.5 inches in each row for the title and the labels.
+    figure.set_figheight(0.4 + rows * (panel_height_in + 0.5))
     for ax, (title, elements) in zip(axes.ravel(), maps.items(), strict=True):
         lines = [line[:, :2] - low for line in elements.polylines]
         draw_lines(
@@ -46,6 +52,7 @@ def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyl
         finish_panel(ax, title)
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_formatter("{x:g} m")
+    # The legend has the classes that occur in a map.
     labels = np.unique(np.concatenate([elements.labels for elements in maps.values()]))
     handles = []
     for label in labels.astype(int).tolist():

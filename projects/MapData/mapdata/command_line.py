@@ -13,7 +13,7 @@ from gsmap.utils.files import file_name
 from gsmap.utils.parallel import default_workers
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options
 
-Options = TypeVar("Options")
+Options = TypeVar("Options")  # a dataclass of options
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,12 @@ class FileOptions:
         y_range: Smallest and largest y of the ground truth in the annotation frame, in metres.
         max_sweeps: Number of earlier LiDAR sweeps per sample.
         out_dir: Folder of the annotation files; None for ``root``.
-        tag: Suffix of the file names, such as ``_extended``.
+        tag: Suffix of the file names, such as ``_extended``; empty for none.
         workers: Number of processes.
-        shard: Part of the samples to convert.
+        shard: Part of the samples to convert; ``WHOLE`` for all samples.
         command: Command line that creates the files, for messages about them.
-        split_name: Name of a published split; empty for the official one.
+        split_name: Name of a published split, which other authors have defined; empty for the
+            official split of the data set.
         split_file: File that defines splits; None for a published split.
         allow_missing: Whether scenes of a published split may be missing.
     """
@@ -39,6 +40,7 @@ class FileOptions:
     root: Path
     _: KW_ONLY
     classes: tuple[str, ...] = CLASSES
+    # Usual ranges of x and y in the LiDAR frame.
     x_range: tuple[float, float] = RANGES["lidar"][0]
     y_range: tuple[float, float] = RANGES["lidar"][1]
     max_sweeps: int = 0
@@ -86,11 +88,12 @@ class FileOptions:
 
 
 def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:
-    """Compute a digest of the source files of an annotation file.
+    """Compute a digest of the source files of an annotation file, to recognise other source files.
 
     Args:
-        sizes: Size of each source file in bytes, by its name.
-        contents: Source files whose content is part of the digest.
+        sizes: Size of each source file in bytes, by its name. The order of the files counts.
+        contents: Source files whose content is part of the digest. Other files count by their sizes
+            alone.
 
     Returns:
         16 hexadecimal digits.
@@ -174,7 +177,7 @@ def add_log_options(parser: argparse.ArgumentParser, usual_rate: str) -> None:
 
 
 def parse_rate(text: str) -> float | None:
-    """Parse samples per second, such as ``2.5hz`` or ``2``; ``all`` gives None.
+    """Parse samples per second, such as ``2.5hz`` or ``2``; ``all`` (every sample) gives None.
 
     Raises:
         ValueError: If the text is not a rate > 0.
@@ -182,7 +185,7 @@ def parse_rate(text: str) -> float | None:
     if text.lower() == "all":
         return None
     rate = float(text.lower().removesuffix("hz"))
-    if not rate > 0:
+    if not rate > 0:  # also refuses NaN
         raise InputError(f"rate must be > 0, got {text}.")
     return rate
 
@@ -198,7 +201,7 @@ def options_from(kind: type[Options], arguments: argparse.Namespace, **more: Any
     Returns:
         The options; fields without an argument have their default.
     """
-    values = vars(arguments) | more
+    values = vars(arguments) | more  # entries of `more` replace arguments
     options = {}
     for field in fields(kind):  # type: ignore[arg-type]
         if field.name in values:

@@ -19,8 +19,10 @@ def mmengine_globals() -> list[Any]:
     arguments, because a malicious file could access memory through numpy's functions.
 
     Returns:
-        Classes, and pairs of a function and the global name that it replaces.
+        Classes, and pairs of a function and the global name that it replaces. This is the form that
+        ``torch.serialization.safe_globals`` takes.
     """
+    # `CHECKED` has the checked functions by the names of numpy's functions that they replace.
     array_functions = [(function, name) for name, function in CHECKED.items()]
     return [HistoryBuffer, *array_functions, (_history_statistic, "builtins.getattr")]
 

@@ -11,6 +11,7 @@ from gsmap.datasets.source import Mount, Source, sample_in_vehicle
 from gsmap.utils.errors import InputError, InputTypeError
 
 VEHICLE = "vehicle"  # frame: x ahead, y left, on the road below the rear axle
+# Arrays of all cameras: by the name of the camera, in a list, or stacked along the first axis.
 Cameras = Mapping[str, np.ndarray] | Sequence[np.ndarray] | np.ndarray
 
 
@@ -26,7 +27,7 @@ def bgr_by_name(images: Cameras) -> dict[str, np.ndarray]:
 
     Raises:
         TypeError: If an image is not uint8.
-        ValueError: If the shape of an image is not (H, W, 3).
+        ValueError: If the shape of an image is not (H, W, 3), or an image has no pixels.
     """
     return {name: _bgr(name, image) for name, image in _by_name(images).items()}
 
@@ -50,9 +51,12 @@ def source_in_memory(
         mount: Place of the frame ``lidar`` or ``ego`` in the vehicle; None for the usual place, and
             for the frame ``vehicle``.
 
+    Returns:
+        Source in the frame ``lidar`` if ``frame`` is ``lidar``, and otherwise in the frame ``ego``.
+
     Raises:
         ValueError: If an array has a wrong shape, a matrix is not a valid calibration, ``frame`` is
-            unknown, or the arguments have different cameras.
+            unknown, the arguments have different cameras, or there is no camera.
     """
     frames = (VEHICLE, *RANGES)  # RANGES has a key for each annotation frame: lidar, ego
     if frame not in frames:
@@ -73,6 +77,7 @@ def source_in_memory(
             cam_from_frame=cam_from_frame[name],
         )
         cameras.append(camera)
+    # `vehicle` is not an annotation frame. Samples in this frame are converted to `ego` below.
     annotation_frame = "ego" if frame == VEHICLE else frame
     sample = MapSample(
         token="in memory",
@@ -80,12 +85,13 @@ def source_in_memory(
         map_name="",
         timestamp_ns=0,
         cameras=cameras,
-        global_from_frame=np.eye(4),
+        global_from_frame=np.eye(4),  # a placeholder: the pose is not known
     )
+    # Raises an error if a matrix of a camera has a wrong shape or is not a valid calibration.
     check_samples([sample], AnnotationMeta("memory", frame=annotation_frame, split="test"))
     if frame == VEHICLE:
-        # The extrinsics of the cameras start from the ground, and are changed to start from the
-        # frame ego.
+        # The transforms of the cameras start from the ground. `sample_in_vehicle` returns a sample
+        # whose transforms start from the frame `ego`.
         sample = sample_in_vehicle(
             "in memory", scene="", timestamp_ns=0, cameras=cameras, global_from_ground=None
         )
@@ -101,7 +107,7 @@ def source_in_memory(
 
 
 def _require_cameras(argument: str, values: Mapping[str, np.ndarray], names: list[str]) -> None:
-    """Raise an error unless an argument has a value for each camera of the images."""
+    """Raise an error unless there are images, and an argument has a value for each camera."""
     if set(values) != set(names) or not names:
         raise InputError(
             f"{argument} must have the cameras of the images, {names}, got {list(values)}."
@@ -121,4 +127,5 @@ def _bgr(name: str, image: np.ndarray) -> np.ndarray:
         raise InputTypeError(f"the image of {name!r} must be uint8, RGB, got {image.dtype}.")
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"the image of {name!r} must have shape (H, W, 3), got {image.shape}.")
+    # A view with other strides, such as a flipped image, is copied for OpenCV.
     return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR)

@@ -25,6 +25,8 @@ from gsmap.utils.overrides import describe_override
 from gsmap.utils.split_lists import SPLIT_LIST
 
 _BROKEN_MODES = ("raise", "skip")
+# Metadata of the annotation file that are copied to the metainfo of the data set. `SPLIT_LIST` is
+# the key of the list by which the samples were split.
 _METAINFO_OF_FILE = (
     "classes", "x_range", "y_range", "dataset", "split", "frame", "ground_z_m", SPLIT_LIST,
 )  # fmt: skip
@@ -154,11 +156,15 @@ class VectorizedMapDataset(BaseDataset):
         )
 
     def load_data_list(self) -> list[dict[str, int]]:
-        """Open and check the annotation file, and list its rows.
+        """Open and check the annotation file, set the metainfo, and list the rows of the file.
 
         Returns:
             For each sample, its ``row`` in the file and ``image_row``, the row of the sample whose
-            images it gets. Both are equal here; `filter_data` may change them.
+            images it gets. Both are equal here; `filter_data` may change ``image_row``.
+
+        Raises:
+            FileNotFoundError: If there is no annotation file.
+            ValueError: If the file is damaged, or differs from an expected value.
         """
         self.annotations = AnnotationFile(self.ann_file)
         self.annotations.require(**self._expected)
@@ -173,6 +179,8 @@ class VectorizedMapDataset(BaseDataset):
         for name in _METAINFO_OF_FILE:
             self._metainfo[name] = getattr(self.annotations.meta, name)
         self._metainfo["ground_z_m"] = self._ground_height()
+        # Checkpoints store the metainfo. From `MOUNT` and `RIG`, a later inference knows where the
+        # frame is in the vehicle, and with which cameras the model was trained.
         self._metainfo[MOUNT] = self._ground_from_first_frame()
         self._metainfo["dim"] = self._dim or self.annotations.meta.dim
         self._metainfo["cameras"] = self.cameras
@@ -233,12 +241,15 @@ class VectorizedMapDataset(BaseDataset):
     def filter_data(self) -> list[dict[str, int]]:
         """Leave out samples without map elements and shuffle images, depending on the arguments.
 
+        Returns:
+            Entries of the remaining samples, in the form of `load_data_list`.
+
         Raises:
             ValueError: If samples for training have no ground truth, or no sample is left.
         """
         rows = np.array([entry["row"] for entry in self.data_list], dtype=np.int64)
         if self._filter_empty_gt:
-            counts = self.annotations.instance_counts()[rows]
+            counts = self.annotations.instance_counts()[rows]  # -1 without ground truth
             if (counts < 0).any():
                 raise InputError(
                     f"{(counts < 0).sum()} samples of {self.ann_file} have no ground truth, so it "
@@ -264,12 +275,16 @@ class VectorizedMapDataset(BaseDataset):
         return entries
 
     def _copy_without_annotation(self, memo: dict[int, Any] | None = None) -> BaseDataset:
-        """Copy with a new memo, because all calls share the default memo of mmengine."""
+        """Copy the data set without its samples, as mmengine does for a subset.
+
+        The memo is the dictionary of ``copy.deepcopy`` for objects that are already copied. All
+        calls share the default memo of mmengine, so a second copy would get objects of the first.
+        """
         return super()._copy_without_annotation({} if memo is None else memo)
 
     def sample(self, idx: int) -> MapSample:
         """Read the record of a sample from the annotation file."""
-        row = super().get_data_info(idx)["row"]  # opens the file if necessary
+        row = super().get_data_info(idx)["row"]  # opens the file on first use
         return self.annotations[row]
 
     def scenes(self) -> list[list[int]]:
@@ -322,8 +337,10 @@ class VectorizedMapDataset(BaseDataset):
             the form of mmdet3d's multi-view pipelines. ``map_instances`` has the elements at full
             resolution, with ``dim`` coordinates per point in metres. ``map_heights`` has the
             heights of the n points of each element in metres, (n,), or None for a file without
-            heights. Further keys are ``dim`` and the metainfo of the packed sample. In names such
-            as ``lidar2global``, ``lidar`` is the annotation frame, as in mmdet3d.
+            heights. ``eval_ann_info`` has labels and polylines for evaluation; it and
+            ``map_instances`` are None without ground truth. Further keys are ``dim`` and the
+            metainfo of the packed sample. In names such as ``lidar2global``, ``lidar`` is the
+            annotation frame, as in mmdet3d.
 
         Raises:
             BrokenSampleError: If the sample lacks a camera of ``cameras``.
@@ -366,7 +383,7 @@ class VectorizedMapDataset(BaseDataset):
         }
         if sample.lidar is not None:
             info.update(self._lidar(sample.lidar))
-        if self.frame_in_memory is not None:
+        if self.frame_in_memory is not None:  # replaces the values of the file
             frame = self.frame_in_memory
             info["token"] = frame.token
             info["scene"] = frame.scene
@@ -377,7 +394,7 @@ class VectorizedMapDataset(BaseDataset):
 
     @property
     def _has_poses(self) -> bool:
-        """Whether the poses of the vehicle are known."""
+        """Whether the poses of the vehicle are known, which is the default of a file."""
         return bool(self.annotations.meta.options.get("poses", True))
 
     def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
@@ -388,6 +405,7 @@ class VectorizedMapDataset(BaseDataset):
         if self.can_bus_in_memory is not None:
             return without_history(self.can_bus_in_memory)
         if self._pose_only_signals:
+            # Imported here, because only few configs need the library of quaternions.
             from gsmap.structures.vehicle_signals import pose_only_signals
 
             global_from_ego = sample.global_from_frame
@@ -420,6 +438,7 @@ class VectorizedMapDataset(BaseDataset):
             if seconds > 0 and after is None:
                 after = pose
         now = (0.0, self._global_from_ground(sample))
+        # Each argument is a time relative to the sample in seconds, and a pose; None if unknown.
         return motion_signals(now, before=before, after=after)
 
     def _global_from_ground(self, sample: MapSample) -> np.ndarray:
@@ -430,7 +449,10 @@ class VectorizedMapDataset(BaseDataset):
         return sample.global_from_frame @ invert_rigid(ground)
 
     def has_signals(self) -> bool:
-        """Test whether samples have vehicle signals that need no poses of other samples."""
+        """Test whether samples have vehicle signals that need no poses of other samples.
+
+        The first sample stands for all samples.
+        """
         return self._pose_only_signals or self.sample(0).can_bus is not None
 
     def _images(self, sample: MapSample, entry: dict[str, int]) -> dict[str, dict[str, Any]]:
@@ -457,6 +479,7 @@ class VectorizedMapDataset(BaseDataset):
             cam2img = np.eye(4)
             cam2img[:3, :3] = cameras[name].intrinsics
             images[name] = {
+                # An image in memory takes the place of its path.
                 "img_path": self.images_in_memory.get(name, path),
                 "size": (image.width, image.height),
                 "cam2img": cam2img,
@@ -488,7 +511,8 @@ class VectorizedMapDataset(BaseDataset):
             idx: Index of the sample.
 
         Returns:
-            Output of the pipeline, or None for a broken sample that is skipped.
+            Output of the pipeline, or None for a broken sample that is skipped. mmengine then takes
+            another sample at random.
 
         Raises:
             BrokenSampleError: If a file is missing or damaged and ``broken_samples`` is ``raise``.
@@ -513,8 +537,9 @@ class VectorizedMapDataset(BaseDataset):
                 )
             return None
         except Exception as error:
-            # An error without a message for the user may come from an override of the command. It
-            # is described here, because a worker process sends only the text of an error.
+            # `user_message` is None for errors that look like a bug. Such an error may come from an
+            # override of the command. `describe_override` finds the override in the frames of the
+            # error. This is done here, because a worker process sends only the text of an error.
             description = None if user_message(error) else describe_override(error)
             if description is None:
                 raise

@@ -31,7 +31,8 @@ from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.overrides import check_kinds
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
-# Keys that configs copy into other sections; no code reads them at the top level
+# Keys that configs copy into other sections; no code reads them at the top level. An override of
+# such a key changes nothing (`_check_effect`).
 _COPIED_KEYS = ("backend_args", "classes", "data_root", "grid", "vis_backends")
 # Valid top-level keys in addition to the runner's arguments; mmengine ignores a misspelt key
 _EXTRA_KEYS = (
@@ -41,7 +42,8 @@ _EXTRA_KEYS = (
 _MAX_WORKERS = 16
 # Endings of the top-level keys whose values must be dictionaries
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
-_PART_LISTS = ("custom_hooks", "param_scheduler")  # keys whose values are parts or lists of parts
+# Keys whose values are configs of a class (dictionaries), or lists of such configs
+_PART_LISTS = ("custom_hooks", "param_scheduler")
 
 
 @cache
@@ -50,6 +52,7 @@ def _known_keys() -> frozenset[str]:
     # this import is slow
     from mmengine.runner import Runner
 
+    # The argument `cfg` of the runner is the whole config.
     runner_keys = frozenset(inspect.signature(Runner).parameters) - {"cfg"}
     return runner_keys | set(_EXTRA_KEYS)
 
@@ -78,10 +81,12 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         path = find_config(config)
         with reading_config(path):
             cfg = Config.fromfile(path, import_custom_modules=False)
+    # `reading_config` names the config, or the part of it, in the message of an error.
     options = dict(cfg_options or {})
     factor = options.pop("image_scale", None)
     for name in options:
         _check_effect(cfg, name=name)
+    # Refuses, for example, a number in place of a dictionary.
     check_kinds(cfg.to_dict(), overrides=options, source=cfg.filename or "the config")
     with reading_config(f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(options)
@@ -90,7 +95,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     _check_keys(cfg)
     _fit_loaders(cfg)
     with reading_config(f"custom_imports of {cfg.filename or 'a config'}"):
-        import_modules_from_strings(["gsmap.registered"])
+        import_modules_from_strings(["gsmap.registered"])  # registers the classes of GSMap
         import_modules_from_strings(**cfg.get("custom_imports", {"imports": []}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
     share_settings(cfg)  # copies settings of the head to the transforms that make its targets
@@ -106,7 +111,7 @@ def _scale_images(cfg: Config, factor: float) -> None:
     steps = scale_steps(cfg, "train", "val", "test")
     if not steps:
         raise InputError(f"--image-scale: no pipeline of {cfg.filename} has ScaleImages.")
-    for step in steps:
+    for step in steps:  # ScaleImages takes either a scale or a size
         step.update(scale=factor, size=None)
 
 
@@ -120,18 +125,19 @@ def _fit_loaders(cfg: Config) -> None:
     Raises:
         ValueError: If ``images_on_device`` is set and a transform reads the pixels on the host.
     """
-    for part in ("train", "val", "test"):
-        loader = cfg.get(f"{part}_dataloader")
+    for split in ("train", "val", "test"):
+        loader = cfg.get(f"{split}_dataloader")
         if not loader:
             continue
         if loader.get("num_workers") == "cores":
+            # torchrun sets the number of processes on this machine.
             processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
             cores = len(os.sched_getaffinity(0)) // processes
             loader.num_workers = min(max(cores, 1), _MAX_WORKERS)
         if not cfg.get("images_on_device"):
             continue
         loader.pin_memory = True
-        for step in pipeline_steps(cfg, part):
+        for step in pipeline_steps(cfg, split):
             if step.type == "LoadCameraImages":
                 step.on_device = True
             elif step.type == "MultiViewWrapper":
@@ -152,9 +158,10 @@ def load_config(args: argparse.Namespace) -> Config:
         args: Parsed arguments; ``config`` and the options of `add_common_arguments` are used.
 
     Raises:
-        FileNotFoundError: As in `read_config`.
+        FileNotFoundError: If there is no such file or model.
         ValueError: As in `read_config` and `check_config`.
     """
+    # mmengine reads the number of this process on its machine from the environment.
     os.environ.setdefault("LOCAL_RANK", str(args.local_rank))
     cfg = read_config(args.config, cfg_options=args.cfg_options)
     cfg.launcher = args.launcher
@@ -167,9 +174,9 @@ def load_config(args: argparse.Namespace) -> Config:
         if name.startswith("_"):
             cfg.pop(name)
     if args.launcher == "pytorch":
-        # torchrun cannot stop its ranks if it is killed with SIGKILL, so each rank watches the
-        # launcher. The environment variable LAUNCHER contains the launcher's process id; by default
-        # the launcher is the parent process.
+        # torchrun cannot stop its ranks (processes of the run) if it is killed with SIGKILL. So
+        # each rank asks Linux to kill it when the launcher ends. The environment variable with the
+        # name LAUNCHER has the launcher's process id; by default, the parent is the launcher.
         launcher_process = int(os.environ.pop(LAUNCHER, os.getppid()))
         die_with_parent(launcher_process)
     if args.launcher == "pytorch" and not torch.cuda.is_available():
@@ -187,7 +194,7 @@ def load_config(args: argparse.Namespace) -> Config:
 
 
 def rank_timeout_s(cfg: Config) -> float:
-    """Return the timeout of collective operations, in seconds.
+    """Return the timeout of collective operations between ranks, in seconds.
 
     Raises:
         ValueError: If ``env_cfg.dist_cfg.timeout`` is not a positive number.
@@ -207,13 +214,14 @@ def newest_checkpoint(
 
     Args:
         work_dir: Folder of the run.
-        read: Function that is called with the path of each undamaged checkpoint, and raises
-            ``ValueError`` if the checkpoint cannot be used.
+        read: Function that is called with the path of an undamaged checkpoint, from the newest on,
+            until it accepts one. It raises ``ValueError`` if the checkpoint cannot be used. None
+            accepts every undamaged checkpoint.
 
     Returns:
         Path of the checkpoint, or None if there is no valid one.
     """
-    numbers: dict[Path, int] = {}
+    numbers: dict[Path, int] = {}  # number of the epoch or iteration of each checkpoint
     for path in Path(work_dir).glob("*.pth"):
         match = re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name)
         if match:
@@ -236,7 +244,7 @@ def _is_undamaged_zip(path: Path) -> bool:
     """Whether a file is a zip archive whose members have the right checksums."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return archive.testzip() is None
+            return archive.testzip() is None  # it returns the name of the first damaged member
     except DAMAGED_ZIP:
         return False
     except OSError as error:
@@ -250,9 +258,10 @@ def check_config(cfg: Config) -> None:
 
     Raises:
         ValueError: If a learning-rate schedule and the training end at different epochs, if the
-            training has no epoch, if the optimizer, runner or backend does not exist, if the
-            pipeline lacks a transform that the head needs, or if a loader does not keep the frame
-            order that a temporal model needs.
+            training has no epoch, if a setting of a loop has a wrong type, if the optimizer, runner
+            or backend does not exist, if the pipeline lacks a transform that the head needs or its
+            settings contradict the head, if a loader does not keep the frame order that a temporal
+            model needs, or if its batch size is not the number of streams.
     """
     check_targets(cfg)
     _check_lengths(cfg)
@@ -280,11 +289,11 @@ def _check_lengths(cfg: Config) -> None:
             raise InputError(
                 f"{cfg.filename}: train_cfg.{name} must be an integer >= 1, got {value!r:.60}."
             )
-    for part in ("val_cfg", "test_cfg"):
-        fp16 = (cfg.get(part) or {}).get("fp16", False)
+    for section in ("val_cfg", "test_cfg"):
+        fp16 = (cfg.get(section) or {}).get("fp16", False)
         if not isinstance(fp16, bool):
             raise InputError(
-                f"{cfg.filename}: {part}.fp16 must be True or False, got {fp16!r:.60}."
+                f"{cfg.filename}: {section}.fp16 must be True or False, got {fp16!r:.60}."
             )
 
 
@@ -323,18 +332,23 @@ def _check_registered(cfg: Config, component: str, registry: Registry, type_name
         cfg: Config that names the class.
         component: Part of the run that the class implements, for the error.
         registry: Registry of mmengine.
-        type_name: Name of the class; other values are not checked.
+        type_name: Name of the class. A class itself, or None, is not checked.
 
     Raises:
         ValueError: If the registry has no such class.
     """
     if isinstance(type_name, str) and registry.get(type_name) is None:
+        # "; did you mean ...?", or an empty text without a similar name
         hint = suggestion(type_name, names=registry_names(registry)) or "."
         raise InputError(f"{cfg.filename}: there is no {component} of type {type_name!r}{hint}")
 
 
 def _check_effect(cfg: Config, name: str) -> None:
-    """Refuse an override of a template value, because the settings in use are copies of it."""
+    """Refuse an override of a template value, because the settings in use are copies of it.
+
+    Template values are the keys ``_name`` and `_COPIED_KEYS`. The error names the copies that the
+    user can override in place of the template value.
+    """
     top, *keys = name.split(".")
     if not (top.startswith("_") or top in _COPIED_KEYS):
         return
@@ -368,7 +382,7 @@ def _find_copies(settings: Any, key: str, value: Any, prefix: str) -> Iterator[s
         prefix: Dotted name of ``settings``, with a final dot; empty at the top level.
     """
     if isinstance(settings, list | tuple):
-        settings = dict(enumerate(settings))
+        settings = dict(enumerate(settings))  # dotted names contain the indices of list entries
     if not isinstance(settings, dict):
         return
     for inner_key, inner_value in settings.items():
@@ -388,7 +402,7 @@ def _check_keys(cfg: Config) -> None:
             raise InputError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
         if key in _PART_LISTS and not isinstance(value, dict | None):
             is_list = isinstance(value, list | tuple)
-            if not is_list or not all(isinstance(part, dict) for part in value):
+            if not is_list or not all(isinstance(entry, dict) for entry in value):
                 raise InputError(
                     f"{cfg.filename}: {key} must be a list of dict(...), got {value!r:.60}."
                 )
@@ -403,7 +417,10 @@ def _check_keys(cfg: Config) -> None:
 
 
 def _check_streams(cfg: Config) -> None:
-    """Require samplers that keep the frames of each scene in order if the model is temporal."""
+    """Require samplers that keep the frames of each scene in order if the model is temporal.
+
+    A temporal model remembers features, queries or map elements of the previous frame.
+    """
     temporal = (cfg.get("model") or {}).get("temporal")
     if temporal is None:
         return
@@ -411,21 +428,24 @@ def _check_streams(cfg: Config) -> None:
     has_trained_memory = temporal.get("bev") is not None or temporal.get("queries") is not None
     if has_trained_memory:  # a memory of map elements alone is not trained
         samplers["train"] = "StreamTrainSampler"
-    for part, needed_sampler in samplers.items():
-        loader = cfg.get(f"{part}_dataloader") or {}
+    for split, needed_sampler in samplers.items():
+        loader = cfg.get(f"{split}_dataloader") or {}
         sampler = loader.get("sampler") or {}
         kind = sampler.get("type")
+        # An unknown type counts as `object`, whose name is not the needed one.
         sampler_class = class_of_type(kind, registry=DATA_SAMPLERS) or object
+        # Subclasses of the needed sampler are allowed.
         class_names = {base.__name__ for base in sampler_class.__mro__}
         if loader and needed_sampler not in class_names:
             raise InputError(
-                f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which may give the frames "
-                "of a scene to several ranks, so model.temporal would not remember the previous "
-                f"frame: set the sampler's type to '{needed_sampler}', or model.temporal=None."
+                f"{cfg.filename}: {split}_dataloader.sampler is {kind!r}, which may give the "
+                "frames of a scene to several ranks, so model.temporal would not remember the "
+                f"previous frame: set the sampler's type to '{needed_sampler}', or "
+                "model.temporal=None."
             )
-        slots = sampler.get("slots")
+        slots = sampler.get("slots")  # number of streams of frames that are read in parallel
         batch_size = loader.get("batch_size")
-        if part == "train" and slots != batch_size:
+        if split == "train" and slots != batch_size:
             raise InputError(
                 f"{cfg.filename}: train_dataloader.batch_size is {batch_size} and sampler.slots is "
                 f"{slots}: each place in the batch follows one stream, so set both to one number."

@@ -6,11 +6,13 @@ from typing import Any
 from mmdet3d.registry import LOG_PROCESSORS
 from mmengine.runner import LogProcessor, Runner
 
-# Items that are removed from lines of iterations: losses of the layers before the last, statistics
-# of the Gaussians, and the time of data loading.
+# Beginnings of the items that are removed from lines of iterations: losses of the layers before the
+# last (``d0.loss_cls``), the time of data loading, and statistics of the Gaussians (``at_floor``
+# and names with a slash).
 _MINOR = re.compile(r"d\d+\.|data_time:|at_floor:|[\w.]+/[\w.]+:")
-# Items that are removed from lines of evaluations: all metrics of MapMetric, except for the AP of
-# each class and group and the mean APs.
+# Beginnings of the items that are removed from lines of evaluations: all metrics of `MapMetric`,
+# except for names that end with AP or mAP, the APs of each class and group and their means. A name
+# that ends with a threshold, such as ``AP@0.5``, is removed.
 _DETAIL = re.compile(r"(.*/)?(chamfer|raster)/(?!.*\bm?AP:)")
 
 
@@ -61,9 +63,9 @@ class MapLogProcessor(LogProcessor):
 def _remove_items(line: str, pattern: re.Pattern[str]) -> str:
     """Remove the items of a log line that match a pattern."""
     # mmengine writes the progress in brackets, then the items, all separated by two blanks.
-    head, _, rest = line.partition("]  ")
-    parts = [f"{head}]"]
-    for item in rest.split("  "):
+    progress, _, items = line.partition("]  ")
+    kept_texts = [f"{progress}]"]
+    for item in items.split("  "):
         if item and not pattern.match(item):
-            parts.append(item)
-    return "  ".join(parts)
+            kept_texts.append(item)
+    return "  ".join(kept_texts)

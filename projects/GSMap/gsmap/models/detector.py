@@ -35,7 +35,7 @@ Samples = Sequence[Det3DDataSample]
 class MapDetector(Base3DDetector):
     """Detector of map elements: image backbone and neck, BEV encoder and head.
 
-    A model with LiDAR also has a LiDAR encoder. A model with both sensors also has a fusion of
+    A model with LiDAR has a LiDAR encoder. A model with cameras and LiDAR also has a fusion of
     their BEV features. Modules are given as configs, or as None if the model does not have them.
 
     Args:
@@ -129,7 +129,7 @@ class MapDetector(Base3DDetector):
         if bool(bev_fuser) != bool(bev_encoder and lidar_encoder):
             raise InputError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
         self.grid = BEVGrid(**grid)
-        shared = {"grid": self.grid}
+        shared = {"grid": self.grid}  # a grid in the config of a module has precedence
         self.bev_encoder = MODELS.build({**shared, **bev_encoder}) if bev_encoder else None
         self.lidar_encoder = MODELS.build({**shared, **lidar_encoder}) if lidar_encoder else None
         self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
@@ -139,7 +139,7 @@ class MapDetector(Base3DDetector):
         if prior is not None:
             self.prior = MODELS.build({"head": self.map_head, "encoder": self.bev_encoder, **prior})
         self.step_graphs: StepGraphs | None = None
-        if cuda_graphs:
+        if cuda_graphs:  # `SWITCH` is the name of this argument
             if reason := reason_against_recording(self):
                 raise InputError(f"{SWITCH}=True does not go with this model: {reason}.")
             self.step_graphs = StepGraphs()
@@ -185,7 +185,10 @@ class MapDetector(Base3DDetector):
         return _split_batch(feats, batch_size=len(imgs))
 
     def _fuses_frozen_norms(self, images: Tensor) -> bool:
-        """Whether the backbone runs as fused convolutions: in half-precision training on a GPU."""
+        """Whether the backbone runs as fused convolutions: in half-precision training on a GPU.
+
+        A compiled backbone is not replaced, because its compiled code would not be used.
+        """
         trains_in_half = self.training and bool(self.autocast)
         if not (trains_in_half and images.is_cuda and self.channels_last):
             return False
@@ -204,7 +207,15 @@ class MapDetector(Base3DDetector):
         self.half_backbone = HalfBackbone()
 
     def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Any]:
-        """Run the encoders. Returns ``bev_feats`` (B, C, H, W), and inputs of encoder losses."""
+        """Run the encoders on a batch.
+
+        Args:
+            batch_inputs: Inputs of the batch: ``imgs`` (B, V, 3, H, W), ``voxels`` or both.
+            batch_data_samples: Samples of the batch, with the calibration in their metainfo.
+
+        Returns:
+            Outputs by name: ``bev_feats`` (B, C, H, W), and inputs of losses of the encoder.
+        """
         with self._training_autocast() as in_half_precision:
             outputs = self._encode(batch_inputs, batch_data_samples)
         return tree_map_only(Tensor, _in_float32, outputs) if in_half_precision else outputs
@@ -236,11 +247,14 @@ class MapDetector(Base3DDetector):
                 feats = self.bev_fuser(outputs["bev_feats"], feats)
             outputs = {**outputs, "bev_feats": feats}
         if self.prior is not None and self.bev_encoder is not None:
+            # The prior reads its map at the pose of each sample, and fuses it with the features.
             outputs = self.prior.fuse(outputs, metas, img_shape=tuple(imgs.shape[-2:]))
         return outputs
 
     def encode_images(self, imgs: Tensor, calibration: Mapping[str, Tensor]) -> dict[str, Any]:
         """Run backbone, neck and BEV encoder on tensors, without meta dicts.
+
+        CUDA graphs record this method (`StepGraphs`), because a graph can only read tensors.
 
         Args:
             imgs: Normalised and augmented images. (B, V, 3, H, W)
@@ -269,7 +283,8 @@ class MapDetector(Base3DDetector):
             batch_data_samples: Samples of the batch.
 
         Yields:
-            The outputs with the memory, and the hooks of the head.
+            The outputs with the memory (``outputs``), and the keyword argument with the hooks of
+            the head (``hooks``, empty if there are none). A hook changes the queries of the head.
         """
         metas = [sample.metainfo for sample in batch_data_samples]
         # The hook receives the predictions of the head, with which `keep` updates the prior below.
@@ -296,6 +311,7 @@ class MapDetector(Base3DDetector):
                 step (`LossCheck`).
         """
         losses = self._losses(batch_inputs, batch_data_samples)
+        # The check and the sum in `parse_losses` need scalars.
         scalars = {}
         for name, loss in losses.items():
             scalars[name] = loss.mean() if loss.dim() else loss
@@ -310,6 +326,7 @@ class MapDetector(Base3DDetector):
             metas = [sample.metainfo for sample in batch_data_samples]
             encoder: Any = self.bev_encoder
             calibration = stack_calibration(metas, encoder.calibration, imgs.device)
+            # The graphs include the head up to its predictions, so the head is not run again.
             outputs, layers = self.step_graphs(self, imgs, calibration=calibration)
             return self.map_head.loss(outputs, batch_data_samples, layers=layers)
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
@@ -368,7 +385,9 @@ class MapDetector(Base3DDetector):
     ) -> None:
         """Load weights with the names of this package or of a release (`adapt_state`)."""
         expected = self.state_dict(prefix=prefix)
+        # Sets of keys that a checkpoint may lack, because the weights initially have no effect.
         neutral = neutral_keys(self, prefix)
+        # Function with which the head adapts weights of another form to its modules.
         fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
         adapt_state(
             state_dict,

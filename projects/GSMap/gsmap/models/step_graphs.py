@@ -63,15 +63,16 @@ class StaticStep(nn.Module):
             of fixed sizes, whose results differ from the default operations by rounding.
 
     Attributes:
-        names: Names of the calibration arrays.
+        names: Names of the calibration arrays that the encoder reads.
     """
 
     def __init__(self, model: Any) -> None:
         super().__init__()
         self.model = model
         self.names: tuple[str, ...] = model.bev_encoder.calibration
-        self._structure: TreeSpec | None = None
-        self._kinds: list[type[Decoded]] = []
+        # Both are set by `forward`, for `restore`.
+        self._structure: TreeSpec | None = None  # nesting of the outputs
+        self._kinds: list[type[Decoded]] = []  # class of the decoder output of each layer
         for part in model.bev_encoder.modules():
             if hasattr(part, "fixed_sizes"):
                 part.fixed_sizes = True
@@ -81,7 +82,7 @@ class StaticStep(nn.Module):
 
         Args:
             images: Normalised and augmented images. (B, V, 3, H, W)
-            calibration: Arrays of ``names``. (B, ...) each
+            calibration: Arrays in the order of ``names``. (B, ...) each
 
         Returns:
             All tensors of the outputs, which `restore` takes.
@@ -89,8 +90,8 @@ class StaticStep(nn.Module):
         arrays = dict(zip(self.names, calibration, strict=True))
         outputs = self.model.encode_images(images, arrays)
         layers = self.model.map_head(outputs)
-        # Only tensors can be returned. So the predictions are replaced by their fields here, from
-        # which `restore` builds the predictions.
+        # A recorded function returns only tensors. So the predictions of a layer are replaced by
+        # their scores and the fields of their decoder output. `restore` builds them from these.
         fields = [(layer.scores, vars(layer.decoded)) for layer in layers]
         self._kinds = [type(layer.decoded) for layer in layers]
         tensors, self._structure = tree_flatten((outputs, fields))
@@ -100,7 +101,7 @@ class StaticStep(nn.Module):
         """Outputs of the encoder and predictions of every layer, from the result of `forward`.
 
         Args:
-            tensors: Tensors in the order of `forward`.
+            tensors: Tensors in the order of `forward`, which must have been called before.
         """
         assert self._structure is not None
         outputs, fields = tree_unflatten(list(tensors), self._structure)
@@ -156,15 +157,16 @@ class StepGraphs:
         Args:
             model: A `MapDetector` in training mode.
             images: Normalised and augmented images. (B, V, 3, H, W)
-            calibration: Arrays that the encoder reads. (B, ...) each
+            calibration: Arrays that the encoder reads, by name, in the order of the encoder.
+                (B, ...) each
 
         Returns:
             Outputs of the encoder, and predictions.
 
         Raises:
             RuntimeError: If a step of this size cannot be recorded.
-            ValueError: If gradients of an earlier step have not been set to None, or autocast is
-                enabled around the model.
+            ValueError: If autocast is enabled around the model, or if, on a GPU, gradients of an
+                earlier step have not been set to None.
         """
         if torch.is_autocast_enabled(images.device.type):
             # Autocast caches weights cast to half precision: all later steps would use the cached
@@ -184,12 +186,13 @@ class StepGraphs:
                 "the previous step: set optim_wrapper.accumulative_counts=1, or leave out the "
                 "switch."
             )
-        # The number of parameters changes if some of them are frozen during the training.
+        # The key is the size of the step: the shapes and types of the inputs, and the number of
+        # parameters, which changes if some of them are frozen during the training.
         key = (len(params), *((tensor.shape, tensor.dtype) for tensor in inputs))
         recording = self._recordings.get(key)
         if recording is None:
             while len(self._recordings) >= _MOST_SIZES:
-                oldest = next(iter(self._recordings))
+                oldest = next(iter(self._recordings))  # a dictionary has the order of insertion
                 del self._recordings[oldest]
             recording = _record(model, inputs, params=params)
             self._recordings[key] = recording
@@ -200,22 +203,23 @@ class StepGraphs:
 class _Replay(torch.autograd.Function):
     """Replay of a recorded forward pass, and of its backward pass.
 
-    The parameters are arguments of `forward` only so that autograd receives their gradients.
+    The parameters are arguments of `forward` only so that autograd receives their gradients. Both
+    passes return views of the recorded memory, which the next replay overwrites.
     """
 
     @staticmethod
     def forward(
         ctx: Any, recording: _Recording, num_inputs: int, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        for buffer, value in zip(recording.inputs, tensors[:num_inputs], strict=True):
-            buffer.copy_(value, non_blocking=True)
+        for recorded_input, value in zip(recording.inputs, tensors[:num_inputs], strict=True):
+            recorded_input.copy_(value, non_blocking=True)
         recording.forward.replay()
         ctx.recording = recording
         ctx.num_inputs = num_inputs
         outputs = []
-        constants = []
+        constants = []  # outputs without gradients
         for output, grad in zip(recording.outputs, recording.output_grads, strict=True):
-            outputs.append(output.detach())
+            outputs.append(output.detach())  # a new tensor object, to which autograd adds a history
             if grad is None:
                 constants.append(outputs[-1])
         ctx.mark_non_differentiable(*constants)
@@ -225,9 +229,9 @@ class _Replay(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         recording = ctx.recording
-        for buffer, grad in zip(recording.output_grads, grads, strict=True):
-            if buffer is not None:
-                buffer.copy_(grad)
+        for recorded_grad, grad in zip(recording.output_grads, grads, strict=True):
+            if recorded_grad is not None:
+                recorded_grad.copy_(grad)
         recording.backward.replay()
         param_grads = []
         for grad in recording.param_grads:
@@ -243,10 +247,15 @@ def _record(model: Any, inputs: Sequence[Tensor], params: Sequence[Tensor]) -> _
         model: A `MapDetector` in training mode.
         inputs: Images and calibration arrays.
         params: Trained parameters.
+
+    Raises:
+        RuntimeError: If the step cannot be recorded.
     """
     step = StaticStep(model)
-    buffers = [tensor.detach().clone() for tensor in inputs]
-    device = buffers[0].device
+    # A graph always reads the memory that it has read while it was recorded. These copies are this
+    # memory. Each replay writes its inputs to them.
+    recorded_inputs = [tensor.detach().clone() for tensor in inputs]
+    device = recorded_inputs[0].device
 
     def run_backward(
         outputs: Sequence[Tensor], output_grads: Sequence[Tensor | None]
@@ -268,20 +277,20 @@ def _record(model: Any, inputs: Sequence[Tensor], params: Sequence[Tensor]) -> _
     with (
         torch.cuda.device(device),
         _unchanged_state(model, device),
-        matrix_products(in_tf32=model.autocast is not None),
+        matrix_products(in_tf32=model.autocast is not None),  # for float32 tensors
     ):
         # As PyTorch demands, the steps before a recording run on another stream.
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
             for _ in range(_WARM_UP):  # errors of the input are raised here
-                outputs = step(*buffers)
+                outputs = step(*recorded_inputs)
                 run_backward(outputs, _empty_grads(outputs))
             del outputs  # frees the tensors of the last step before the recording
         torch.cuda.current_stream().wait_stream(stream)
         try:
             with capture(forward):
-                outputs = step(*buffers)
+                outputs = step(*recorded_inputs)
             output_grads = _empty_grads(outputs)
             with capture(backward):
                 param_grads = run_backward(outputs, output_grads)
@@ -294,7 +303,7 @@ def _record(model: Any, inputs: Sequence[Tensor], params: Sequence[Tensor]) -> _
         step=step,
         forward=forward,
         backward=backward,
-        inputs=buffers,
+        inputs=recorded_inputs,
         outputs=tuple(output.detach() for output in outputs),
         output_grads=output_grads,
         param_grads=param_grads,

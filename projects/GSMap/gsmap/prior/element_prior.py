@@ -36,6 +36,7 @@ _MOST_VERTICES = 4_000_000  # of all elements together
 # Limit for areas whose outline crosses itself: each crossing makes the repair slower.
 _MOST_VERTICES_OF_CROSSED_AREA = 50
 _FARTHEST_M = 1e7  # largest coordinate of a vertex
+# A tile in a file consists of its counts and, compressed, its stored elements and their vertices.
 _COUNTS = np.dtype([("elements", "<u4"), ("vertices", "<u4")])
 _STORED = np.dtype([("label", "<u2"), ("score", "<f4"), ("num_vertices", "<u4")])
 _VERTEX = np.dtype("<f8")
@@ -71,8 +72,9 @@ class ElementPrior:
         content: Word for the stored data in messages.
 
     Raises:
-        ValueError: If a label, a score or a vertex is out of range, an element has no length, the
-            outline of an area is long and crosses itself, or there are too many elements.
+        ValueError: If a label, a score or a vertex is out of range, an element has no length or
+            fewer than two vertices, the outline of an area is long and crosses itself, or there are
+            too many elements or vertices.
     """
 
     content: ClassVar[str] = "elements"
@@ -123,9 +125,11 @@ class ElementPrior:
         labels: list[int] = []
         scores: list[float] = []
         num_vertices_left = _MOST_VERTICES
+        # Position and checksum of each tile in `content`, the bytes of the whole file.
         for offset, length, crc in entries.values():
             packed = content[offset : offset + length]
             stored, lines = _unpack(packed, crc=crc, path=path, most_vertices=num_vertices_left)
+            # The limit holds for all tiles together, so a damaged file cannot fill the memory.
             num_vertices_left -= int(stored["num_vertices"].sum(dtype=np.int64))
             polylines += lines
             labels += stored["label"].tolist()
@@ -133,7 +137,7 @@ class ElementPrior:
         try:
             elements = MapElements.from_polylines(polylines, labels=labels, scores=scores)
             return cls(file_settings, elements, rule)
-        # An `InputError` of the constructor is a ValueError, so it gets the path of the file here.
+        # The constructor raises an `InputError`, a ValueError, whose message lacks the path.
         except ValueError as error:
             text = str(error).rstrip(".")
             raise InputError(f"{path} is damaged: {text}; build it again.") from error
@@ -146,6 +150,7 @@ class ElementPrior:
 
         Raises:
             RuntimeError: If the file is reserved by another process.
+            ValueError: If the tiles of the settings are too small for the extent of the map.
         """
         tiles = self._packed_tiles()
         save_file(Path(path), self.settings, rule=self.rule, tiles=tiles, magic=ELEMENT_MAGIC)
@@ -162,11 +167,12 @@ class ElementPrior:
             Parts of the elements in the range, (x, y) in metres in the frame, with confidences.
 
         Raises:
-            ValueError: If ``pose`` is no rigid transform or too far from the origin.
+            ValueError: If ``pose`` is no rigid transform, too far from the origin, or without yaw.
         """
-        frame = planar_pose(pose)
+        frame = planar_pose(pose)  # position and yaw, without height, roll and pitch
         x0, x1 = grid.x_range
         y0, y1 = grid.y_range
+        # Corners of the range in the global frame. (4, 2)
         corners = frame.to_global(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
         # Along each axis, compare the bounding box of each element with the one of the range. Both
         # overlap if each begins before the other ends. (N, 2)
@@ -200,7 +206,7 @@ class ElementPrior:
             Values in [0, 1], float32 on the device of ``pose``. (C, H, W)
 
         Raises:
-            ValueError: If ``pose`` is no rigid transform or too far from the origin.
+            ValueError: If ``pose`` is no rigid transform, too far from the origin, or without yaw.
         """
         elements = self.read_elements(pose, grid)
         raster = torch.zeros(len(self.settings.classes), grid.height, grid.width)
@@ -210,7 +216,9 @@ class ElementPrior:
                 is_area = self.settings.classes[label] in AREA_CLASSES
                 # A closed line of three vertices runs back and forth and has no area.
                 is_filled.append(is_area and len(line) > 3 and is_closed(line))
+            # Covered share of each cell, for each element. (N, H, W)
             masks = draw_polylines(
+                # Shorter lines are padded with their last vertex, which draws nothing.
                 torch.from_numpy(pad_lines(elements.polylines)).float(),
                 grid,
                 width_m=self.rule.line_width_m,
@@ -228,9 +236,11 @@ class ElementPrior:
         tiles = np.floor(first_vertices / self.settings.tile_m).astype(np.int64)
         if np.abs(tiles).max(initial=0) > FARTHEST_TILE:
             raise InputError(f"tiles of {self.settings.tile_m:g} m are too small for this map.")
+        # `row` is the index of an element; `column` and `tile_row` are the position of a tile.
         for row, (column, tile_row) in enumerate(tiles.tolist()):
             rows_of_tile[column, tile_row].append(row)
         packed = []
+        # Sorted, so that equal maps give equal files.
         for key, rows in sorted(rows_of_tile.items()):
             packed.append((key, _pack(self.elements.select(np.array(rows)))))
         return packed
@@ -268,7 +278,7 @@ def _check_areas(elements: MapElements, classes: Sequence[str]) -> None:
     is_long = elements.num_points > _MOST_VERTICES_OF_CROSSED_AREA
     for row in np.flatnonzero(is_area[elements.labels] & is_long):
         outline = shapely.Polygon(elements.polylines[row])
-        if not shapely.is_valid(outline):
+        if not shapely.is_valid(outline):  # an outline that crosses itself is invalid
             raise InputError(
                 f"an area with {elements.num_points[row]} vertices crosses itself: at most "
                 f"{_MOST_VERTICES_OF_CROSSED_AREA} are possible then; repair it."

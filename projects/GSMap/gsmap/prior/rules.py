@@ -16,6 +16,9 @@ States = NDArray[np.uint8]
 class WriteRule:
     """Rule that updates the cells in view and converts their states to values in [0, 1].
 
+    The state of a cell consists of S stored numbers for each map class. The value of a cell is the
+    belief in [0, 1] that the class is there. A prediction above 0 is a hit, and 0 is a miss.
+
     A subclass is a dataclass whose fields are numbers; the file of a prior stores them. In the
     shapes below, C is the number of map classes and n the number of cells.
 
@@ -32,7 +35,7 @@ class WriteRule:
 
         Args:
             states: States before the frame. (S, C, n)
-            values: Prediction in [0, 1]; 0 is a miss. (C, n)
+            values: Prediction of the frame in [0, 1]; 0 is a miss. (C, n)
 
         Returns:
             States after the frame. (S, C, n)
@@ -65,12 +68,13 @@ class KeepMaximum(WriteRule):
 class LastSeen(WriteRule):
     """Last prediction with a linear decay by each miss: the rule of HRMapNet's test.
 
-    A cell starts at 100. A hit p > 0 raises it to at least 100 + 30 p, so hits do not add up. A
-    miss subtracts 1 from a cell of at least 100, and sets a lower cell to 99. The value of a cell v
-    is (v - 100) / 30, clipped to [0, 1], so a certain prediction (p = 1) lasts for 30 misses.
+    A cell has one stored number v, which starts at 100. A hit p > 0 raises v to at least
+    100 + 30 p, so hits do not add up. A miss subtracts 1 if v is at least 100, and sets a lower v
+    to 99. The value of the cell is (v - 100) / 30, clipped to [0, 1], so a certain prediction
+    (p = 1) lasts for 30 misses.
 
     Args:
-        gain: Rise of a cell by a certain prediction, and number of misses that it lasts.
+        gain: Rise of v by a certain prediction, and number of misses that it lasts (30 above).
         lowest: Smallest state.
         highest: Largest state.
 
@@ -111,11 +115,12 @@ class LastSeen(WriteRule):
 class HitMissCounts(WriteRule):
     """Counts of hits and misses per cell, both with exponential decay.
 
-    A frame with a cell in view multiplies both counts by ``decay`` and adds p to the hits and 1 - p
-    to the misses. The value of a cell is hits / (hits + misses + prior_count). Cells that are out
-    of view or occluded keep their counts. The upper bound of a count, 1 / (1 - decay), is stored as
-    255. Counts are rounded to integers; a count to which nothing is added is rounded down, so that
-    it decreases.
+    A frame with a cell in view multiplies both counts by ``decay``. It then adds its prediction p
+    to the hits and 1 - p to the misses. Cells that are out of view or occluded keep their counts.
+    The value of a cell is hits / (hits + misses + prior_count).
+
+    The upper bound of a count, 1 / (1 - decay), is stored as 255. Counts are rounded to integers. A
+    count to which nothing is added is rounded down, so that it decreases.
 
     Args:
         decay: Factor of older counts at each view, in [0.5, 0.98].
@@ -138,12 +143,12 @@ class HitMissCounts(WriteRule):
 
     @property
     def _unit(self) -> np.float32:
-        """Number that is stored for a count of 1."""
+        """Number that is stored for a count of 1, as 255 is stored for 1 / (1 - decay)."""
         return np.float32(255 * (1 - self.decay))
 
     def update(self, states: States, values: Floats) -> States:
         """Update cells that are in view. (S, C, n), (C, n) -> (S, C, n)"""
-        added = np.stack([values, 1 - values])
+        added = np.stack([values, 1 - values])  # to hits and misses (2, C, n)
         counts = states * np.float32(self.decay)
         counts += self._unit * added
         # `astype` rounds down. With 0.5 added, it rounds to the nearest integer.
@@ -166,7 +171,7 @@ RULES: dict[str, type[WriteRule]] = {
 
 
 def rule_settings(rule: Any, rules: Mapping[str, type] = RULES) -> dict[str, Any]:
-    """Convert a rule to the settings that `rule_from_settings` reads."""
+    """Convert a rule to the settings that `rule_from_settings` reads: its name and its numbers."""
     names = {kind: name for name, kind in rules.items()}
     fields: dict[str, Any] = asdict(rule)
     return {"name": names[type(rule)]} | fields
@@ -177,19 +182,23 @@ def rule_from_settings(settings: Any, rules: Mapping[str, type] = RULES) -> Any:
 
     Args:
         settings: Name of the rule as ``name``, and its numbers.
-        rules: Classes of rules by their names; their fields are numbers.
+        rules: Classes of rules by their names; their fields are numbers with defaults.
+
+    Returns:
+        The rule, an instance of one of the classes.
 
     Raises:
         ValueError: If the rule is unknown or its settings are invalid.
     """
+    # A list, because the name may be of a type that cannot be a key, such as a dictionary.
     if not isinstance(settings, dict) or settings.get("name") not in list(rules):
         raise InputError(f"the rule must have a name that is one of {sorted(rules)}.")
     kind = rules[settings["name"]]
     numbers = {name: value for name, value in settings.items() if name != "name"}
-    expected = set(rule_settings(kind(), rules)) - {"name"}
+    expected = set(rule_settings(kind(), rules)) - {"name"}  # names of the numbers of this rule
     if set(numbers) != expected:
         raise InputError(f"the rule {settings['name']} must have the settings {sorted(expected)}.")
     for name, number in numbers.items():
-        if isinstance(number, bool) or not isinstance(number, (int, float)):
+        if isinstance(number, bool) or not isinstance(number, (int, float)):  # a bool is an int
             raise InputError(f"the setting {name} of the rule must be a number.")
     return kind(**numbers)

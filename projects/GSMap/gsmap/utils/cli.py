@@ -60,9 +60,9 @@ class CommandParser(argparse.ArgumentParser):
         self, *args: Any, **kwargs: Any
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse arguments; NaN, and files that are both input and output, are errors."""
-        namespace, rest = super().parse_known_args(*args, **kwargs)
+        namespace, unparsed = super().parse_known_args(*args, **kwargs)
         inputs: list[Path] = []
-        outputs: list[tuple[Path, str]] = []
+        outputs: list[tuple[Path, str]] = []  # each with the option that names it
         for action in self._actions:
             option = action.option_strings[0] if action.option_strings else action.metavar
             value = getattr(namespace, action.dest, None)
@@ -74,14 +74,16 @@ class CommandParser(argparse.ArgumentParser):
                 elif path.is_file():
                     inputs.append(path)
         declare_files(inputs=inputs, outputs=outputs)
+        # `run_command` blames an override for an error that the override causes.
         overrides = getattr(namespace, "cfg_options", None)
         declare_overrides(overrides if isinstance(overrides, dict) else {})
-        return namespace, rest
+        return namespace, unparsed
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and a message, with the most similar option or choice, and exit."""
         match = re.fullmatch(r"unrecognized arguments: .*?(--[\w-]+).*", string=message, flags=re.S)
         if match:
+            # "; did you mean ...?", or an empty text without a similar option
             message += suggestion(match[1], self._option_names())
         super().error(message)
 
@@ -175,6 +177,8 @@ def end_process(code: int) -> NoReturn:
         code: Exit code.
     """
     try:
+        # Two steps of a normal end of Python: wait for threads that are no daemons, and call the
+        # functions that are registered with `atexit`.
         threading._shutdown()  # type: ignore[attr-defined]
         atexit._run_exitfuncs()
         sys.stdout.flush()
@@ -210,6 +214,7 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
                 sys.stdout.write(f"{text}\n")
             sys.stdout.flush()
         except Exception as error:
+            # A library may replace the exception of a signal by another exception.
             cause = _signal_behind(error)
             # After a signal, an OSError comes from a clean-up that failed, and is reported below.
             if cause is not None and not isinstance(error, OSError):
@@ -239,11 +244,12 @@ def _install(handler: "_SignalHandler", clean_up_on_kill: bool) -> None:
     """Install the handlers of signals and of errors in threads, and unblock the signals."""
     logging.raiseExceptions = False  # no traceback for a log file on a full disk
     threading.excepthook = _report_thread_error
+    # The hook is a `partial` of `_hide_signal`, whose function is its attribute `func`.
     is_installed = getattr(sys.unraisablehook, "func", None) is _hide_signal
     if not is_installed:  # the first command of the process
         sys.unraisablehook = partial(_hide_signal, sys.unraisablehook)
     kill_forks_with_parent()
-    report_lost_batches()
+    report_lost_batches()  # workers send the error of a batch that they cannot serialise
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # ignored in the background of a shell
         signal.signal(signal.SIGINT, handler)
     signal.signal(signal.SIGTERM, handler if clean_up_on_kill else signal.SIG_DFL)
@@ -297,13 +303,13 @@ class _SignalHandler:
     """
 
     def __init__(self) -> None:
-        self._main = os.getpid()
-        self._raise_time_s = -math.inf
+        self._main_process = os.getpid()
+        self._raise_time_s = -math.inf  # time of the last exception, on the monotonic clock
         self.received: int | None = None  # signal whose exception was raised
-        self.has_ended = False
+        self.has_ended = False  # from then on, no signal is sent again
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        if os.getpid() != self._main:
+        if os.getpid() != self._main_process:  # a forked worker
             if number == signal.SIGINT:
                 return
             sys.exit(128 + number)
@@ -327,7 +333,7 @@ class _SignalHandler:
 
     def _handle_drop(self, number: int) -> None:
         """Send a signal again whose exception was dropped."""
-        if not self.has_ended and os.getpid() == self._main:
+        if not self.has_ended and os.getpid() == self._main_process:
             self._raise_time_s = -math.inf
             self._send_again(number)
 
@@ -340,6 +346,7 @@ class _SignalHandler:
 
 
 def _send_later(number: int) -> None:
+    """Wait, and send a signal to the main thread, which runs the handlers of signals."""
     time.sleep(RESEND_DELAY_S)
     signal.pthread_kill(threading.main_thread().ident or 0, number)
 
@@ -347,6 +354,7 @@ def _send_later(number: int) -> None:
 def _imports_extension(frame: FrameType | None) -> bool:
     """Whether an extension module is being imported; an exception there may end the process."""
     while frame is not None:
+        # Python's loader of extension modules runs their code in these methods.
         if frame.f_code.co_name in ("create_module", "exec_module"):
             loader = frame.f_locals.get("self")
             if isinstance(loader, ExtensionFileLoader):
@@ -377,7 +385,7 @@ def output_file(text: str) -> Path:
     """Parse the path of an output file, and check that it can be written.
 
     Raises:
-        OSError: If the path is a folder, or no file can be created there.
+        OSError: If the path is a folder, or the file can be neither created nor replaced.
     """
     path = Path(text)
     # Nearest parent that exists; the others are created with the file.
@@ -393,5 +401,5 @@ def output_file(text: str) -> Path:
 
 
 def _os_error(number: int, path: Path) -> OSError:
-    """Return the error of the system with this number, for a path."""
+    """Return the error of the system with this number, such as ``errno.EISDIR``, for a path."""
     return OSError(number, os.strerror(number), str(path))

@@ -18,10 +18,15 @@ class CompilationNotice(event.Listener):
     has_logged = False
 
     def on_start(self, event: event.Event) -> None:
-        """Log the notice before the first compilation."""
+        """Log the notice before the first compilation.
+
+        Args:
+            event: Start of a compilation, not used.
+        """
         if not self.has_logged and is_first_rank():
             logging.getLogger("gsmap").warning(
                 "Kernels for the CPU are compiled, which takes up to a minute."
+                # A temporary folder keeps no kernels for later runs.
                 + ("" if _FOLDER else _CACHE_NOTE)
             )
         self.has_logged = True
@@ -36,7 +41,8 @@ def make_kernel_folder() -> TemporaryDirectory | None:
     This process and its child processes use the folder. It is removed at the end of this process.
 
     Returns:
-        The folder, or None if numba has a cache folder.
+        The folder, or None if numba has a cache folder. The folder is removed when the returned
+        object is garbage collected, so the caller must keep it.
     """
     try:
         # The constructor raises an error if it finds no cache folder for a function of this file.
@@ -44,7 +50,7 @@ def make_kernel_folder() -> TemporaryDirectory | None:
     except RuntimeError:
         folder = TemporaryDirectory(prefix="gsmap-kernels-")
         os.environ["NUMBA_CACHE_DIR"] = folder.name
-        numba.config.reload_config()
+        numba.config.reload_config()  # numba reads the environment again
         if is_first_rank():
             logging.getLogger("gsmap").warning(
                 "Neither the installation nor the home folder can be written to, so that kernels "
@@ -55,6 +61,7 @@ def make_kernel_folder() -> TemporaryDirectory | None:
     return None
 
 
+# Both objects are kept until the end of the process.
 NOTICE = CompilationNotice()
 event.register(kind="numba:compile", listener=NOTICE)
 _FOLDER = make_kernel_folder()

@@ -17,20 +17,21 @@ def lazy_names(
         others: For each name from another package, the full name of the module that defines it.
 
     Returns:
-        ``__getattr__``, ``__dir__`` and ``__all__``.
+        ``__getattr__``, ``__dir__`` and ``__all__``, which the package assigns to these names.
     """
-    places = {name: f"{package}.{module}" for name, module in modules.items()}
-    places.update(others or {})
+    module_of_name = {name: f"{package}.{module}" for name, module in modules.items()}
+    module_of_name.update(others or {})
 
     def load(name: str) -> Any:
-        if name not in places:
+        if name not in module_of_name:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = import_module(places[name])
+        module = import_module(module_of_name[name])
         value = getattr(module, name)
-        setattr(sys.modules[package], name, value)  # later uses do not call this function
+        # Python calls this function only for names that the package does not have yet.
+        setattr(sys.modules[package], name, value)
         return value
 
     def list_names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *places})
+        return sorted({*vars(sys.modules[package]), *module_of_name})
 
-    return load, list_names, sorted(places)
+    return load, list_names, sorted(module_of_name)

@@ -9,13 +9,17 @@ from typing import Any, ClassVar
 from gsmap.utils.errors import InputError
 
 _NUMBER_WORDS = ("auto", "cores", "dynamic")  # texts that some settings take in place of a number
-_SEARCHED_FRAMES = 10  # number of frames that are searched, from the one that raises the error
+# Number of frames (calls on the stack) that are searched, from the one that raises the error.
+_SEARCHED_FRAMES = 10
 # Last parts of the names that are not searched, because other options of commands set these values.
 _UNSUSPECTED = ("data_root", "image_scale")
 
 
 class _Command:
-    """Overrides of the running command, by dotted name."""
+    """Overrides of the running command, by dotted name, such as ``model.map_head.num_points``.
+
+    The class is never instantiated. It holds the one value of the process.
+    """
 
     overrides: ClassVar[dict[str, Any]] = {}
 
@@ -86,12 +90,12 @@ def _wanted_kind(old_value: Any, value: Any) -> str | None:
 
 
 def _is_section(value: Any) -> bool:
-    """Whether a value is a dictionary, or an empty list, which may stand for a list of them."""
+    """Whether a value is a section (a dictionary), or an empty list of sections."""
     return isinstance(value, dict) or value in ([], ())
 
 
 def _holds_sections(value: Any) -> bool:
-    """Whether a value is a dictionary or a list of dictionaries."""
+    """Whether a value is a section (a dictionary), or a list of sections that is not empty."""
     if isinstance(value, dict):
         return True
     is_list = isinstance(value, list | tuple) and len(value) > 0
@@ -111,7 +115,7 @@ def find_override(error: BaseException) -> str | None:
     Returns:
         The override as ``NAME=VALUE``; None if no frame uses one.
     """
-    suspects = {}
+    suspects = {}  # last part of the name, and value, of each override by its full name
     for name, value in _Command.overrides.items():
         keys = [key for key in name.split(".") if not key.isdigit()]
         if keys and keys[-1] not in _UNSUSPECTED:
@@ -119,7 +123,9 @@ def find_override(error: BaseException) -> str | None:
     if not suspects:
         return None
     for number, frame in enumerate(_frames(error)):
-        # The frame that raises the error is searched even if it is of the loop.
+        # mmengine's loop has the settings of all parts, so a value that is found there does not
+        # show which code uses it. The frame that raises the error is searched even if it is of the
+        # loop.
         reaches_loop = number > 0 and _is_of_loop(frame)
         if number == _SEARCHED_FRAMES or reaches_loop:
             break
@@ -157,7 +163,8 @@ def describe_override(error: BaseException) -> str | None:
 
 def _frames(error: BaseException) -> Iterator[FrameType]:
     """Yield the frames of an error after the frames of its cause, both from the innermost one."""
-    cause = error.__cause__ or error.__context__  # mmengine replaces errors of hooks
+    # For an error of a hook, mmengine raises another error, whose cause is the original one.
+    cause = error.__cause__ or error.__context__
     if cause is not None:
         yield from _frames(cause)
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
@@ -185,10 +192,12 @@ def _scopes(frame: FrameType) -> Iterator[Mapping[str, Any]]:
 def _has_value(scope: Mapping[str, Any], key: str, value: Any) -> bool:
     """Whether a scope has a value under a name, with or without a leading underscore."""
     for name in (key, f"_{key}"):
-        found = scope.get(name)
-        # A part may convert a list of the config to a tuple.
-        same_kind = type(found) is type(value) or isinstance(found, list | tuple | dict)
-        if same_kind and repr(_plain(found)) == repr(_plain(value)):
+        candidate = scope.get(name)
+        # A part may convert a list of the config to a tuple, so containers may differ in type.
+        # Otherwise types must be equal, because True == 1. Texts are compared, because == does not
+        # return a boolean for arrays in a container.
+        may_be_equal = type(candidate) is type(value) or isinstance(candidate, list | tuple | dict)
+        if may_be_equal and repr(_plain(candidate)) == repr(_plain(value)):
             return True
     return False
 

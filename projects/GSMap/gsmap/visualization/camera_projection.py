@@ -9,7 +9,7 @@ import numpy as np
 
 NEAR_M = 0.3
 """Smallest depth in metres of a visible point."""
-_NUM_PLANES = 5  # planes of the frustum
+_NUM_PLANES = 5  # planes of the frustum: near, left, right, top and bottom
 
 
 def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarray:
@@ -18,7 +18,10 @@ def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarra
 
 
 def _frustum_values(points: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Compute five values of each point, which are all >= 0 in the frustum. (n, 3) -> (5, n)"""
+    """Compute one value of each point for each plane of the frustum. (n, 3) -> (5, n)
+
+    A value is >= 0 on the inner side of its plane. For example, u >= 0 becomes u w >= 0.
+    """
     width, height = size_px
     uw, vw, w = points.T
     return np.stack([w - NEAR_M, uw, width * w - uw, vw, height * w - vw])
@@ -32,7 +35,8 @@ def project_segments(
     Args:
         starts: First end points in metres. (n, 3)
         ends: Second end points in metres. (n, 3)
-        img_from_frame: Projection matrix, intrinsics times extrinsics. (4, 4)
+        img_from_frame: Projection matrix, intrinsics times extrinsics, from the frame of the end
+            points. (4, 4)
         size_px: Width and height of the image in pixels.
 
     Returns:
@@ -53,7 +57,7 @@ def project_segments(
     fraction = np.where(crosses, first_values / change, 0.0)
     enter = np.where(crosses & first_outside, fraction, 0.0).max(axis=0)  # (n,)
     leave = np.where(crosses & last_outside, fraction, 1.0).min(axis=0)  # (n,)
-    is_outside = (first_outside & last_outside).any(axis=0)
+    is_outside = (first_outside & last_outside).any(axis=0)  # both ends are beyond one plane
     index = np.flatnonzero((enter < leave) & ~is_outside)
     direction = (last - first)[index]
     fractions = np.stack([enter, leave], axis=1)[index, :, None]  # (m, 2, 1)
@@ -70,14 +74,15 @@ def project_polygon(
 
     Args:
         ring: Vertices in metres; the first one may be repeated at the end. (n, 3)
-        img_from_frame: Projection matrix, intrinsics times extrinsics. (4, 4)
+        img_from_frame: Projection matrix, intrinsics times extrinsics, from the frame of the
+            vertices. (4, 4)
         size_px: Width and height of the image in pixels.
 
     Returns:
         Visible part in pixels, empty if there is none. (m, 2)
     """
     points = _homogeneous_px(ring, img_from_frame)
-    for plane in range(_NUM_PLANES):
+    for plane in range(_NUM_PLANES):  # each plane cuts the result of the planes before it
         values = _frustum_values(points, size_px)[plane]
         next_points = np.roll(points, -1, axis=0)
         next_values = np.roll(values, -1)
@@ -110,10 +115,11 @@ def subdivide(points: np.ndarray, step_m: float) -> np.ndarray:
     """
     lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths_m / step_m).astype(int), 1)
-    # The position i + s is at the share s of the segment from vertex i to vertex i + 1.
-    parts = [index + np.arange(count) / count for index, count in enumerate(counts)]
+    # The position i + s is at the share s of the segment from vertex i to vertex i + 1. A segment
+    # has the positions from its start on, without its end, which is the start of the next segment.
+    segment_positions = [index + np.arange(count) / count for index, count in enumerate(counts)]
     last_position = len(points) - 1.0
-    positions = np.concatenate([*parts, [last_position]])  # (m,)
+    positions = np.concatenate([*segment_positions, [last_position]])  # (m,)
     vertices = np.arange(len(points))
     columns = [np.interp(positions, vertices, column) for column in points.T]
     return np.stack(columns, axis=1)

@@ -15,8 +15,8 @@ from av2.map.pedestrian_crossing import PedestrianCrossing
 from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError
 
-# For each layer, by its key in the file: name of an element in messages, constructor of an element,
-# and the least number of points of each of its lines.
+# For each layer (kind of map elements), by its key in the file: name of an element in messages,
+# constructor of an element, and the least number of points of each of its lines by their keys.
 _LAYERS: dict[str, tuple[str, Callable[[Any], Any], dict[str, int]]] = {
     "lane_segments": (
         "lane segment",
@@ -42,7 +42,8 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
         The map, and the ids of the unusable elements, by a text with their kind and the reason.
 
     Raises:
-        ValueError: If the file is damaged, lacks a layer, or a layer has no usable element.
+        ValueError: If the file is damaged, lacks a layer, or a layer has no usable element. A file
+            may lack pedestrian crossings, and a layer may be empty.
     """
     left_out: dict[str, list[str]] = defaultdict(list)
     with explain_errors(path, "download it again"):
@@ -54,20 +55,22 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
             records = content.get(key, {}) if may_be_absent else content[key]
             for element_id, record in records.items():
                 try:
-                    # Any error about the content becomes a ``ValueError`` with its reason.
+                    # Any error about the content becomes a ``ValueError``. Its text begins with the
+                    # name of the element and ends with the remedy, here "it is left out".
                     with explain_errors(name, "it is left out"):
                         _check_lines(record, min_points)
                         layers[key][record["id"]] = from_dict(record)
                 except ValueError as error:
                     reason = str(error)
                     left_out[reason].append(str(element_id))
-            if records and not layers[key]:
+            if records and not layers[key]:  # `reason` is of the last element of the layer
                 raise InputError(f"none of its {len(records)} {key} can be used: {reason}")
     static_map = ArgoverseStaticMap(
         log_id=path.stem.split("log_map_archive_")[1],
         vector_drivable_areas=layers["drivable_areas"],
         vector_lane_segments=layers["lane_segments"],
         vector_pedestrian_crossings=layers["pedestrian_crossings"],
+        # Only the vector map is read.
         raster_drivable_area_layer=None,
         raster_roi_layer=None,
         raster_ground_height_layer=None,
@@ -81,7 +84,8 @@ def _check_lines(record: Any, min_points: dict[str, int]) -> None:
         points = record[key]
         if len(points) < least:
             raise InputError(f"its {key} has {len(points)} points, and needs {least}")
-        total = 0  # finite only if all coordinates are
+        # The sum is finite only if all coordinates are. A value that is no number raises an error.
+        total = 0
         for point in points:
             total += point["x"]
             total += point["y"]

@@ -17,7 +17,9 @@ _DATE = re.compile(
 
 def natural_sort_key(path: Path) -> list[str | int]:
     """Sort key of a file's path, in which digits count as numbers: 2 before 10."""
-    parts = re.split(r"(\d+)", path.as_posix())  # text and digits alternate, beginning with text
+    # Text and digits alternate, beginning with text that may be empty. So numbers are never
+    # compared with text.
+    parts = re.split(r"(\d+)", path.as_posix())
     return [int(part) if number % 2 else part for number, part in enumerate(parts)]
 
 
@@ -25,14 +27,14 @@ def times_of_names(stems: Collection[str]) -> dict[str, int] | None:
     """Parse the Unix times at the ends of file names.
 
     A time has 10 digits (s), 13 (ms), 16 (us) or 19 (ns), or is in seconds with a fraction. It is
-    in the years 2000 to 2099. If the numbers of all names can be read as dates, such as 2023100512,
-    none of them is taken as a time.
+    in the years 2000 to 2099. A date and hour such as 2023100512 is also a Unix time in seconds, of
+    the year 2034. Therefore no number is taken as a time if the numbers of all names can be dates.
 
     Args:
         stems: File names without their suffixes.
 
     Returns:
-        Times in nanoseconds by name; None if a name has no time.
+        Times in nanoseconds by name; None if a name has no time, or if all numbers can be dates.
     """
     times = {}
     are_dates = True
@@ -52,6 +54,7 @@ def _time_ns(whole: str, fraction: str | None) -> int | None:
         return None  # only seconds have a fraction
     # 10 digits are in seconds. With each further digit, the unit is ten times smaller.
     time_ns = unix_time_ns(int(whole), unit_ns=10 ** (19 - len(whole)))
-    if time_ns is None:
+    if time_ns is None:  # not in the years 2000 to 2099
         return None
+    # The fraction of a second is filled up to nine digits, which are nanoseconds.
     return time_ns + int((fraction or "0").ljust(9, "0"))

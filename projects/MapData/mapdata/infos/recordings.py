@@ -14,6 +14,7 @@ from gsmap.utils.errors import InputError
 from mapdata.infos.plain_pickle import load_plain_pickle
 from mapdata.unix_times import in_nanoseconds
 
+# End of the message if an entry of the file lacks a field or has a wrong value.
 _REMEDY = (
     "GSMap needs images (img_path, cam2img, lidar2cam), lidar_points (lidar2ego), ego2global and "
     "timestamp"
@@ -36,7 +37,8 @@ def read_info_file(
 
     Raises:
         FileNotFoundError: If the file or one of its images is missing.
-        ValueError: If the file is not an info file of this format.
+        ValueError: If the file is not an info file of this format, a sample has no camera with an
+            image and a calibration, or a value of a sample is missing or wrong.
     """
     path = Path(path)
     root = Path(path.parent if data_root is None else data_root)
@@ -48,9 +50,11 @@ def read_info_file(
             "mmdet3d with mmdet3d's tools/dataset_converters/update_infos_to_v2.py."
         )
     samples = []
+    # Metadata for the checks of samples in the LiDAR frame. No file is written with it.
     meta = AnnotationMeta("mmdet3d", "lidar", split="test")
     for i, info in enumerate(content["data_list"]):
         where = f"{path}, sample {i}"
+        # Errors about the content become a ValueError with the name of the sample and the remedy.
         with explain_errors(where, _REMEDY):
             sample = _sample(info, root, where=where, allow_missing=allow_missing_cameras)
             check_samples([sample], meta)
@@ -104,12 +108,15 @@ def _locate(name: str, folder: str, root: Path, owner: str) -> Path:
 
     Args:
         name: Path of the file.
-        folder: Folder of nuScenes below ``samples``.
+        folder: Folder of the sensor in nuScenes, below ``samples``. Its name is the sensor's name.
         root: Data root.
         owner: Sample and sensor of the file, for messages.
 
     Returns:
         Path relative to ``root``.
+
+    Raises:
+        FileNotFoundError: If neither path is a file.
     """
     usual = Path("samples", folder, Path(name).name)
     path = find_file(name, root) or find_file(str(usual), root)
@@ -143,7 +150,7 @@ def _cameras(
     cameras = []
     for name, info in images.items():
         if not info.get("img_path") or info.get("lidar2cam") is None:
-            continue
+            continue  # the info file has no image or no calibration of this camera
         try:
             cameras.append(_camera(name, info, root=root, where=where))
         except FileNotFoundError:
@@ -165,6 +172,7 @@ def _sample(info: Mapping[str, Any], root: Path, where: str, allow_missing: bool
     lidar_record = None
     if lidar.get("lidar_path"):
         path = _locate(lidar["lidar_path"], "LIDAR_TOP", root=root, owner=f"{where}, LiDAR")
+        # The annotation frame is the frame of the LiDAR.
         lidar_record = LidarRecord(path.as_posix(), frame_from_lidar=np.eye(4))
     return MapSample(
         token=str(info.get("token", info.get("sample_idx", where))),

@@ -1,4 +1,8 @@
-"""Logs (recorded drives) of py123d: times, poses of the vehicle, and cameras."""
+"""Logs (recorded drives) of py123d: times, poses of the vehicle, and cameras.
+
+A log is a folder of Arrow tables: one with the times of the frames, one with the poses of the
+vehicle, and one for each sensor. The metadata of a table is a dictionary.
+"""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -18,10 +22,10 @@ from mapdata.folders.rig import PoseTrack, rotation_of
 from mapdata.paths import path_below
 from mapdata.py123d.packed import metadata_of
 
-SYNC = "sync.arrow"
+SYNC = "sync.arrow"  # table with the time of each frame, and its row in the table of each sensor
 _MAP = Path("map.arrow")  # in the folder of a log
-_EGO = "ego_state_se3"
-REMEDY = "convert the log again with py123d"
+_EGO = "ego_state_se3"  # table with the poses of the IMU; its metadata describe the vehicle
+REMEDY = "convert the log again with py123d"  # `explain_errors` adds it to errors about a table
 _CAMERA_PREFIX = "camera."
 _PNG_START = b"\x89PNG"
 
@@ -46,8 +50,9 @@ class Camera:
         path: Table of the camera in the folder of the log.
 
     Attributes:
-        key: Name of the columns of the camera.
+        key: Prefix of the columns of the camera's table, and name of its column in ``sync.arrow``.
         name: Name of the camera.
+        metadata: Metadata of the table, with the size and the calibration of the camera.
         image_rows: Number of images.
 
     Raises:
@@ -59,6 +64,7 @@ class Camera:
         self.name = self.key.removeprefix(_CAMERA_PREFIX)
         with explain_errors(path, REMEDY):
             columns = map(self._column, ("timestamp_us", "data", "camera_to_global_se3"))
+            # Images stay on the disk until they are used.
             self._table = read_table(path, columns=list(columns), memory_map=True)
             self.metadata = metadata_of(self._table)
             self.image_rows = self._table.num_rows
@@ -97,8 +103,12 @@ class Camera:
             row: Row of the image.
             track: Poses of the IMU, from which the pose is computed if the table has none.
 
+        Returns:
+            Transform from the camera to the global frame, in metres.
+
         Raises:
-            ValueError: If there is no pose.
+            ValueError: If there is no pose, or it is not valid.
+            KeyError: If the pose is computed and the table has no extrinsics.
         """
         values = self._value("camera_to_global_se3", row)
         if values is not None:
@@ -109,9 +119,9 @@ class Camera:
         return global_from_imu @ pose_of(self.metadata["camera_to_imu_se3"])
 
     def image_path(self, row: int, root: Path, scene: str) -> str:
-        """Path of an image below the data root.
+        """Path of an image, relative to the data root.
 
-        The table has either the path or the encoded image. An image is written to a file.
+        The table has either the path or the encoded image. An encoded image is written to a file.
 
         Args:
             row: Row of the image.
@@ -119,12 +129,14 @@ class Camera:
             scene: Name of the log.
 
         Raises:
-            ValueError: If the table has neither a path nor a valid image in this row.
+            ValueError: If the table has neither a path nor a valid image in this row, or if the
+                path leads out of the data root.
+            KeyError: If the metadata lack the size of an encoded image.
         """
         data = self._value("data", row)
         where = f"camera {self.name!r}"
         if isinstance(data, str):
-            path_below(root, name=data, noun=f"{where}: the path")
+            path_below(root, name=data, noun=f"{where}: the path")  # only to check the path
             return data
         if not isinstance(data, bytes):
             raise InputError(f"{where} has no image in row {row}")
@@ -145,12 +157,13 @@ class Camera:
         They have the keys of a camera record of `mapdata.custom.from_records`.
 
         Raises:
-            ValueError: If a value is missing.
+            KeyError: If a value is missing.
+            ValueError: If there are not five intrinsics.
         """
         fx, fy, cx, cy, skew = self.metadata["intrinsics"]
         distortion = self.metadata.get("distortion")
         if distortion is None or self.metadata.get("is_undistorted"):
-            distortion = []
+            distortion = []  # the images have none
         return {
             "name": self.name,
             "width": self.metadata["width"],
@@ -167,7 +180,9 @@ class Log:
         folder: Folder of the log, with ``sync.arrow`` and a table for each sensor.
 
     Attributes:
+        folder: Folder of the log.
         name: Name of the folder, which is the scene of the samples.
+        metadata: Metadata of ``sync.arrow``, with the location and the map of the log.
 
     Raises:
         FileNotFoundError: If a table is missing.
@@ -197,6 +212,10 @@ class Log:
 
         Args:
             root: Folder of py123d's data, with ``logs`` and ``maps``.
+
+        Raises:
+            KeyError: If the metadata of the map lack the data set or the location.
+            ValueError: If the path leads out of the folder of maps.
         """
         metadata = self.metadata.get("map_metadata")
         if not isinstance(metadata, dict):
@@ -213,7 +232,7 @@ class Log:
 
     @cached_property
     def track(self) -> PoseTrack:
-        """Poses of the IMU in the global frame, by time in nanoseconds."""
+        """Poses of the IMU in the global frame by time in nanoseconds, interpolated in between."""
         with explain_errors(self.folder / f"{_EGO}.arrow", REMEDY):
             times_ns = [1000 * time for time in self._ego[f"{_EGO}.timestamp_us"].to_pylist()]
             poses = map(pose_of, self._ego[f"{_EGO}.imu_se3"].to_pylist())
@@ -235,6 +254,7 @@ class Log:
             metadata = metadata_of(self._ego)
             imu_from_center = pose_of(metadata["center_to_imu_se3"])
             axle_from_center = invert_rigid(self.imu_from_axle) @ imu_from_center
+            # The bottom is half the height of the box below its centre.
             return float(axle_from_center[2, 3]) - float(metadata["height"]) / 2
 
     @cached_property
@@ -266,7 +286,10 @@ class Log:
         return sorted(names - cameras - {Path(SYNC).stem, _MAP.stem, _EGO})
 
     def frames(self) -> Iterator[tuple[int, dict[str, int | None]]]:
-        """Yield the time of each frame in nanoseconds, and the row of its image by camera."""
+        """Yield the time of each frame in nanoseconds, and the row of its image by camera.
+
+        The row is None for a camera without an image in the frame.
+        """
         with explain_errors(self.folder / SYNC, REMEDY):
             times = self._sync["sync.timestamp_us"].to_pylist()
             rows = {}

@@ -1,7 +1,8 @@
 """Columns of an annotation file, and conversion of samples to and from rows.
 
 Each column has the name of a field of `MapSample`. Nested records are nested columns, and both
-conversions follow these nested types.
+conversions follow these nested types. A *record* is here a dataclass: a sample, or one of its
+cameras, LiDAR scans, sweeps and map elements.
 """
 
 import json
@@ -23,9 +24,10 @@ from gsmap.datasets.annotations.record import (
 from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.utils.errors import InputError
 
-META_KEY = b"gsmap"
-_POSE = pa.list_(pa.float64(), 16)
+META_KEY = b"gsmap"  # key of the metadata, as JSON, in the schema of the file
+_POSE = pa.list_(pa.float64(), 16)  # a (4, 4) matrix, row by row
 _INTRINSICS = pa.list_(pa.float64(), 9)
+# Shapes of the fields that are stored as flat lists of fixed length.
 _SHAPES = {
     "intrinsics": (3, 3),
     "can_bus": (NUM_CAN_BUS,),
@@ -61,6 +63,7 @@ FIELDS = {
     "instances": pa.list_(_INSTANCE),
 }
 _SAMPLE = pa.struct(FIELDS)
+# Class of the records that each nested type stores.
 _RECORDS: dict[pa.DataType, Any] = {
     _CAMERA: CameraRecord,
     _SWEEP: SweepRecord,
@@ -73,7 +76,7 @@ _RECORDS: dict[pa.DataType, Any] = {
 def schema_of(meta: AnnotationMeta) -> pa.Schema:
     """Return the schema of a file with its metadata."""
     values = asdict(meta)
-    if meta.ground_z_m is None:  # left out for earlier versions, which lack this field
+    if meta.ground_z_m is None:  # left out, so that earlier versions, without it, read the file
         del values["ground_z_m"]
     return pa.schema(FIELDS, metadata={META_KEY: json.dumps(values).encode()})
 
@@ -83,14 +86,14 @@ def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]
 
     Args:
         record: Sample or record.
-        meta: Metadata of the file.
+        meta: Metadata of the file: annotation frame, and number of coordinates of a point.
         where: Beginning of error messages.
 
     Returns:
-        Values by the name of the column.
+        Values by the name of the column. Matrices and points are flat arrays.
 
     Raises:
-        ValueError: If a matrix or an element has another shape, or is not numeric.
+        ValueError: If a matrix or the points of an element have a wrong shape or are not numeric.
     """
     if isinstance(record, MapSample):
         where += f"sample {record.token!r}: "
@@ -121,6 +124,7 @@ def _flatten(value: Any, name: str, dim: int, where: str) -> np.ndarray:
         num_points = array.size // dim
         shape = (max(num_points, 2), dim)  # an array of fewer than two points has another shape
         wanted = f"(n >= 2, {dim})"
+    # The kinds are signed and unsigned integers, and floating-point numbers.
     if array.shape != shape or array.dtype.kind not in "iuf":
         raise InputError(
             f"{where}{name} must be numbers {wanted}, got {array.dtype} {array.shape}."
@@ -163,8 +167,10 @@ def matrices_of(array: pa.FixedSizeListArray, shape: tuple[int, ...]) -> np.ndar
 def decoder_of(array: pa.Array, dim: int, name: str = "") -> Callable[[int], Any]:
     """Return a function that creates the record, or the value, of a row.
 
+    All columns are prepared here once, so that reading a row is fast.
+
     Args:
-        array: Records, or the values of a field of records, after validation.
+        array: Records, or the values of a field of records. The file must have been checked.
         dim: Coordinates per point, 2 or 3.
         name: Name of the field; empty for whole records.
 
@@ -181,11 +187,12 @@ def decoder_of(array: pa.Array, dim: int, name: str = "") -> Callable[[int], Any
 def _decoder_of_valid(array: pa.Array, dim: int, name: str) -> Callable[[int], Any]:
     """Return a function that creates the record, or the value, of a row that is not missing."""
     if pa.types.is_struct(array.type):
-        record = _RECORDS[array.type]
+        record_class = _RECORDS[array.type]
         decoders = {}
-        for part in array.type:
-            decoders[part.name] = decoder_of(array.field(part.name), dim=dim, name=part.name)
-        return lambda i: record(**{field: decode(i) for field, decode in decoders.items()})
+        for field in array.type:
+            decoders[field.name] = decoder_of(array.field(field.name), dim=dim, name=field.name)
+        return lambda i: record_class(**{key: decode(i) for key, decode in decoders.items()})
+    # Matrices and points are copied: the arrays may be read-only views of the mapped file.
     if name in _SHAPES:
         matrices = matrices_of(array, _SHAPES[name])
         return lambda i: matrices[i].copy()
@@ -193,7 +200,7 @@ def _decoder_of_valid(array: pa.Array, dim: int, name: str) -> Callable[[int], A
         starts = array.offsets.to_numpy() // dim  # offsets count coordinates, starts count points
         points = array.values.to_numpy().reshape(-1, dim)
         return lambda i: points[starts[i] : starts[i + 1]].copy()
-    if pa.types.is_list(array.type):
+    if pa.types.is_list(array.type):  # a list of records, such as the cameras
         starts = array.offsets.to_numpy()
         decode_item = decoder_of(array.values, dim=dim)
         return lambda i: [decode_item(j) for j in range(starts[i], starts[i + 1])]

@@ -31,17 +31,20 @@ _MAX_BILINEAR_SHRINKAGE = 2.0
 class LoadCameraImages(BaseTransform):
     """Load and check the images of all cameras.
 
-    It adds the keys of ``LoadMultiViewImageFromFiles`` of mmdet3d that other transforms read, and
-    ``lidar2img``, ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Smaller images are padded
-    at the bottom and right to the size of the largest. ``raw_shapes`` has (height, width) of each
-    image without the padding, and later transforms keep it up to date. Unlike in mmdet3d, images
-    are contiguous arrays and not strided views of a stack: a copy of such a view takes as long as
-    the decoding of the image.
+    The transform adds the keys of ``LoadMultiViewImageFromFiles`` of mmdet3d that other transforms
+    read, and ``lidar2img``, ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. The matrix
+    ``img_aug_matrix`` collects the changes of pixel coordinates by later transforms.
+
+    Smaller images are padded at the bottom and right to the size of the largest. ``raw_shapes`` has
+    (height, width) of each image without the padding, and later transforms keep it up to date.
+    Unlike in mmdet3d, images are contiguous arrays and not strided views of a stack: a copy of such
+    a view takes as long as the decoding of the image.
 
     Args:
         to_float32: Whether to convert the images to float32 directly after loading.
         on_device: Whether to leave the images in uint8 and to record the later image steps
-            (`image_steps`), which the GPU then carries out.
+            (`image_steps`), which the GPU then carries out. ``to_float32`` then converts nothing
+            here.
     """
 
     to_float32: bool = True
@@ -67,18 +70,18 @@ class LoadCameraImages(BaseTransform):
             max_height = max(max_height, height)
             max_width = max(max_width, width)
         shape = (max_height, max_width)
-        converts = self.to_float32 and not self.on_device
+        converts_here = self.to_float32 and not self.on_device
         results["img"] = []
         for image in images:
             if image.shape[:2] != shape:
                 image = mmcv.impad(image, shape=shape)
-            if converts:
+            if converts_here:
                 image = image.astype(np.float32)
             results["img"].append(image)
-        results["to_float32"] = self.to_float32
+        results["to_float32"] = self.to_float32  # `ScaleImages` rounds pixels if this is False
         results["raw_shapes"] = raw_shapes
         if self.on_device:
-            results["image_steps"] = []
+            results["image_steps"] = []  # the list makes later transforms record their steps
         results["img_shape"] = results["ori_shape"] = results["pad_shape"] = shape
         results["num_views"] = len(images)
         for key in ("img_path", "cam2img", "lidar2cam"):
@@ -122,7 +125,7 @@ class ScaleImages(BaseTransform):
         if (self.scale is None) == (self.size is None):
             raise InputError(f"give scale or size, got {self.scale} and {self.size}.")
         smallest = min(self.size) if self.size else cast(float, self.scale)
-        if not smallest > 0:
+        if not smallest > 0:  # also refuses NaN
             raise InputError(f"scale or size must be > 0, got {self.size or self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
@@ -134,6 +137,7 @@ class ScaleImages(BaseTransform):
         if self.size is not None:
             width, height = self.size
             return self._resize_to_size(results, size=(int(width), int(height)))
+        # The recorded steps have not changed the pixels yet, so the images may have another size.
         height, width = shape_after_steps(results)
         size = self.output_size(width, height)
         by_area = False
@@ -148,17 +152,19 @@ class ScaleImages(BaseTransform):
             raise InputError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
         if by_area:
+            # No image step averages by area, so all recorded steps are carried out on the host now.
             finish_on_host(results)
             images = results["img"]
             results["img"] = [mmcv.imresize(img, size, interpolation="area") for img in images]
         elif size != (width, height):
+            # Resizes the images now, or records the step for the GPU.
             take_step(results, self._resize_step(results, size))
         _transform_pixels(results, matrix)
         raw_shapes = []
         for raw_height, raw_width in results["raw_shapes"]:
             raw_shapes.append((round(raw_height * matrix[1, 1]), round(raw_width * matrix[0, 0])))
         results["raw_shapes"] = raw_shapes
-        results["img_shape"] = results["pad_shape"] = size[::-1]
+        results["img_shape"] = results["pad_shape"] = size[::-1]  # (height, width)
         results["scale_factor"] = size[0] / width
         return results
 
@@ -171,12 +177,13 @@ class ScaleImages(BaseTransform):
         step = self._resize_step(results, size)
         raw_shapes = results["raw_shapes"]
         if len(set(raw_shapes)) > 1:
+            # A recorded step would resize all images, with their padding, by equal factors.
             finish_on_host(results)
             cropped_images = []
             for image, (height, width) in zip(results["img"], raw_shapes, strict=True):
                 cropped_images.append(image[:height, :width])
             results["img"] = step.on_host(cropped_images)
-        else:
+        else:  # no image has padding
             take_step(results, step)
         scalings = []
         for height, width in raw_shapes:
@@ -184,6 +191,7 @@ class ScaleImages(BaseTransform):
         for key in ("lidar2img", "img_aug_matrix"):
             pairs = zip(scalings, results[key], strict=True)
             results[key] = [scaling @ projection for scaling, projection in pairs]
+        # Shapes are (height, width).
         results["raw_shapes"] = [size[::-1]] * len(results["img"])
         results["img_shape"] = results["pad_shape"] = size[::-1]
         return results
@@ -253,13 +261,18 @@ def _log_other_scale(
     trained_size: tuple[int, ...],
     by_area: bool,
 ) -> None:
-    """Log once that images are not resized by the factor in the config; sizes in pixels."""
+    """Log once that images are not resized by the factor in the config.
+
+    The cache skips a call with arguments that have been logged. Sizes are width and height in
+    pixels.
+    """
     worker = get_worker_info()
-    if worker is None or worker.id == 0:
-        kernel = ", by area" if by_area else ""
+    if worker is None or worker.id == 0:  # only one of the loader's workers logs
+        by_area_text = ", by area" if by_area else ""
         print_log(
             f"images of {input_size[0]} x {input_size[1]} are scaled to {output_size[0]} x "
-            f"{output_size[1]}, without cropping or padding{kernel}, as the model was trained at "
-            f"{trained_size[0]} x {trained_size[1]}; --image-scale gives another factor.",
+            f"{output_size[1]}, without cropping or padding{by_area_text}, as the model was "
+            f"trained at {trained_size[0]} x {trained_size[1]}; --image-scale gives another "
+            "factor.",
             logger="current",
         )

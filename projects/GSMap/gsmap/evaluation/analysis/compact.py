@@ -19,7 +19,7 @@ from gsmap.utils.errors import InputError
 
 _DECIMALS = 3  # control points are written in whole millimetres
 _ROUNDING_M = 0.001  # bound on the displacement of a curve by this rounding
-_POINT_KEYS = ("pts", "pts_num", "gaussian_scales", "gaussian_rotations")
+_POINT_KEYS = ("pts", "pts_num", "gaussian_scales", "gaussian_rotations")  # replaced by a curve
 
 
 class Compaction(NamedTuple):
@@ -43,8 +43,9 @@ def compact_results(
 ) -> Compaction:
     """Write a result file with piecewise Bezier curves, which all readers of GSMap accept.
 
-    A vector is the JSON object of one element. A curve replaces its points and the Gaussians of
-    the points; other entries are kept. A vector with fewer than two points is not changed.
+    A vector is the JSON object of one element, whose points are the vertices of a line. A curve
+    replaces the points and their Gaussians; other entries of the vector are kept. A vector with
+    fewer than two points is not changed.
 
     Args:
         results: Path of the result file.
@@ -68,12 +69,15 @@ def compact_results(
     num_vertices = 0
     num_controls = 0
     largest_m = 0.0
+    # `item` is the JSON object of a sample, and `elements` are its vectors in their order.
     for item, token, elements, _ in file.raw():
         vectors = []
         for vector, points in zip(item["vectors"], elements.polylines, strict=True):
             if len(points) < 2:
                 vectors.append(vector)
                 continue
+            # Indices of the vertices at which pieces of the curve begin and end. The error that
+            # rounding adds below is subtracted from the limit.
             joints = fit_joints(points, degree, max_error_m - _ROUNDING_M)
             controls = controls_between(points, joints, degree).round(_DECIMALS)
             vectors.append(_replace_points(vector, controls=controls, degree=degree))
@@ -83,6 +87,7 @@ def compact_results(
             num_controls += len(controls)
             largest_m = max(largest_m, error_m)
         samples.append((token, vectors))
+    # `about`, the metadata of the file, is set only after the last sample was read.
     meta = {**file.about, "bezier_max_error_m": max_error_m}
     write_results(out, samples=samples, meta=meta)
     return Compaction(
@@ -102,16 +107,18 @@ def _largest_error(
 ) -> float:
     """Compute the largest distance, in metres, of a piecewise curve from its line.
 
+    Each piece is compared with the part of the line that it approximates.
+
     Args:
         points: Vertices of the line in metres. (n, D)
         joints: Indices of the vertices at which pieces begin and end.
         controls: Control points of all pieces. Consecutive pieces share one point. (m, D)
         degree: Degree of the curve.
     """
-    errors = []
+    errors_m = []
     for piece, (start, end) in enumerate(pairwise(joints)):
         first_control = piece * degree
         piece_controls = controls[first_control : first_control + degree + 1]
         curve = curve_points(piece_controls, degree=degree)
-        errors.append(largest_deviation(points[start : end + 1], curve))
-    return max(errors)
+        errors_m.append(largest_deviation(points[start : end + 1], curve))
+    return max(errors_m)

@@ -1,6 +1,7 @@
 """Reading of the drives of a result file, writing of their tracks, and evaluation of consistency.
 
-A track is the number of one map element over the frames of a drive.
+A track is the number of one map element over the frames of a drive. A frame is one sample. The
+consistency of predictions over the frames is evaluated with tracks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +41,8 @@ def drive_frames(
     Raises:
         FileNotFoundError: If the result file does not exist.
         ValueError: If the file is malformed or lacks a sample, if some but not all vectors have a
-            track, or if two elements of a class in a sample have equal tracks.
+            track, or if two elements of a class in a sample have equal tracks. Also if the
+            annotations have no poses, or a sample has no ground truth.
     """
     return _read_frames(SampleFile(results, key=RESULTS_KEY, classes=classes), annotations)
 
@@ -54,9 +56,9 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
         raise InputError(f"{annotations.path} knows no poses, which consistency needs.")
     results = samples.path
     predictions: dict[str, MapElements] = {}
-    track_ids: dict[str, IntArray | None] = {}
+    track_ids: dict[str, IntArray | None] = {}  # None for a sample without tracks
     last_token: dict[bool, str] = {}  # last sample with tracks (True) and without (False)
-    items = items_of(results, RESULTS_KEY, "give a result file")
+    items = items_of(results, RESULTS_KEY, "give a result file")  # the text is advice in errors
     # The file is read by two iterators in step. `samples` checks and converts each item; `items`
     # yields the unchanged item with its tracks. `zip` advances its first argument first. This must
     # be `samples`, so that it raises the error of a malformed item before the item is used.
@@ -67,7 +69,7 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
             _check_tracks(ids, elements=elements, results=results, token=token)
         predictions[token] = elements
         track_ids[token] = ids
-        if len(elements):
+        if len(elements):  # an empty sample does not show whether the file has tracks
             last_token[ids is not None] = token
     if len(last_token) > 1:
         raise InputError(
@@ -82,6 +84,7 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
         )
     scenes = annotations.column("scene")
     times = annotations.column("timestamp_ns")
+    # Rows of the annotations, sorted by scene and within a scene by time.
     order = sorted(zip(scenes, times, range(len(annotations)), strict=True))
     frames = []
     for _, _, row in order:
@@ -118,10 +121,11 @@ def _check_tracks(ids: IntArray, elements: MapElements, results: Path, token: st
     # The columns of `pairs` are the distinct pairs (label, track).
     pairs, counts = np.unique([elements.labels, ids], axis=1, return_counts=True)
     tracks = pairs[1]
-    repeated = tracks[(counts > 1) & (tracks >= 0)]
-    if len(repeated):
+    repeated_tracks = tracks[(counts > 1) & (tracks >= 0)]  # -1 is no track, and may repeat
+    if len(repeated_tracks):
+        track = repeated_tracks[0]
         raise InputError(
-            f"{results}, sample {token!r}: two elements of a class have {TRACK_KEY} {repeated[0]}: "
+            f"{results}, sample {token!r}: two elements of a class have {TRACK_KEY} {track}: "
             "a track is one element in each frame."
         )
 
@@ -168,10 +172,13 @@ def evaluate_drives(
         tracks_file: Path at which results are written with the ``track_id`` of each element, or
             None.
 
+    Returns:
+        Figures by name, such as ``consistency/C-mAP``.
+
     Raises:
         FileNotFoundError: If the result file does not exist.
-        ValueError: If the file is malformed or lacks a sample, or the annotations have no ground
-            truth.
+        ValueError: If the file is malformed, lacks a sample or has invalid tracks
+            (`drive_frames`), or if the annotations have no poses or no ground truth.
     """
     samples = SampleFile(results, key=RESULTS_KEY, classes=config.classes)
     frames = _read_frames(samples, annotations)

@@ -1,4 +1,10 @@
-"""Files with the matches of one shard (a part of the samples), and evaluation of all shards."""
+"""Files with the matches of one shard (a part of the samples), and evaluation of all shards.
+
+A file is an npz archive with the array ``notes``, and for each metric the tokens of the samples as
+``<metric>/tokens``. The arrays of all samples are concatenated to ``<metric>/<name>``, and the
+length of each sample's part is in ``<metric>/<name>/lengths``. The manifest beside the file has the
+rules of the evaluation: names and settings of the metrics, and resampling of the ground truth.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -19,6 +25,7 @@ from gsmap.utils.shards import Shard, ShardFile
 SHARD_KIND = "matches"
 # Errors of code that reads a manifest or arrays of another form than expected.
 _FAULTS = (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError)
+# Endings of the names of arrays.
 _TOKENS = "/tokens"
 _LENGTHS = "/lengths"
 Arrays = Mapping[str, npt.NDArray[Any]]
@@ -52,19 +59,20 @@ def write_matches(
     Args:
         target: File for the figures of all shards; it determines the path of the shard.
         shard: Index of the shard, and number of shards.
-        matches: Records of each sample of the shard, by name of the metric.
+        matches: For each sample of the shard, the record of each metric by the metric's name.
         notes: Notes for the user.
         evaluator: Evaluator, as `MapEvaluator.from_names` creates it from ``settings``.
         settings: Settings of the metrics.
-        source: Digest of results and ground truth.
+        source: Digest of results and ground truth, by which the shards of one evaluation are
+            recognised.
 
     Returns:
-        Path of the file.
+        Path of the file of the shard.
     """
     arrays = {"notes": np.array(notes, dtype=str)}
     for metric in evaluator.metrics:
         records = [sample[metric.name] for sample in matches]
-        if records:
+        if records:  # a shard without samples has only the notes
             arrays |= _join_records(metric.name, records=records)
     with atomic_write(shard.path_of(target), mode="wb") as file:
         np.savez_compressed(file, **arrays)
@@ -83,10 +91,11 @@ def write_matches(
 def _join_records(metric: str, records: Sequence[Matches]) -> dict[str, npt.NDArray[Any]]:
     """Concatenate the arrays of all samples along the first axis, and add their lengths."""
     tokens = []
-    columns: dict[str, list[npt.NDArray[Any]]] = {}
+    columns: dict[str, list[npt.NDArray[Any]]] = {}  # by name: an array for each sample
     for record in records:
         tokens.append(record.token)
         for name, values in arrays_of(record).items():
+            # A single number becomes one row, since arrays are concatenated along their rows.
             columns.setdefault(name, []).append(np.atleast_1d(values))
     joined: dict[str, npt.NDArray[Any]] = {f"{metric}{_TOKENS}": np.array(tokens)}
     for name, parts in columns.items():
@@ -99,7 +108,8 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
     """Compute the metrics from all shards, with figures equal to a run without shards.
 
     Args:
-        shards: Shards, as ``find_shards`` returns them.
+        shards: Finished shards, at least one, as ``find_shards`` returns them. All have equal
+            rules, so the manifest of the first one is enough.
 
     Returns:
         Reports of all metrics, and the notes of all shards without repeats.
@@ -120,7 +130,7 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
         try:
             with np.load(shard.path) as file:
                 notes += file["notes"].tolist()
-                arrays = dict(file)
+                arrays = dict(file)  # reads all arrays before the file is closed
             if len(arrays) > 1:  # more than the notes: the shard has samples
                 matches += _split_samples(arrays, evaluator)
         except (*_FAULTS, *DAMAGED_ZIP) as error:
@@ -128,31 +138,43 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
                 f"the matches in {shard.path} do not fit the rules of its manifest ({error!r}): "
                 "make that shard again."
             ) from error
-    return evaluator.reports(matches), list(dict.fromkeys(notes))
+    unique_notes = list(dict.fromkeys(notes))  # in the order of their first occurrence
+    return evaluator.reports(matches), unique_notes
 
 
 def _split_samples(arrays: Arrays, evaluator: MapEvaluator) -> list[SampleMatches]:
     """Split the arrays of all metrics into records of samples."""
-    metrics = set()
+    stored_metrics = set()
     for name in arrays:
         if name.endswith(_TOKENS):
-            metrics.add(name.removesuffix(_TOKENS))
-    empty = evaluator.match_empty()  # a record of each metric, with the names of its arrays
-    if metrics != empty.keys():
-        raise InputError(f"it has matches of {sorted(metrics)}, not of {sorted(empty)}")
-    columns = []
+            stored_metrics.add(name.removesuffix(_TOKENS))
+    # Record of a sample without elements, by metric: it has the names and shapes of the arrays.
+    empty = evaluator.match_empty()
+    if stored_metrics != empty.keys():
+        raise InputError(f"it has matches of {sorted(stored_metrics)}, not of {sorted(empty)}")
+    records_of_metrics = []
     for metric, like in empty.items():
-        columns.append(_split_records(arrays, metric=metric, like=like))
+        records_of_metrics.append(_split_records(arrays, metric=metric, like=like))
     samples = []
-    for records in zip(*columns, strict=True):
+    # An error is raised if the metrics have different numbers of samples.
+    for records in zip(*records_of_metrics, strict=True):
         samples.append(dict(zip(empty, records, strict=True)))
     return samples
 
 
 def _split_records(arrays: Arrays, metric: str, like: Matches) -> Iterator[Matches]:
-    """Split the arrays of one metric into records of samples."""
+    """Split the arrays of one metric into records of samples.
+
+    Args:
+        arrays: Arrays of the file, by name.
+        metric: Name of the metric.
+        like: Record of an empty sample of the metric.
+
+    Raises:
+        ValueError: If lengths, names or shapes do not fit.
+    """
     tokens = arrays[f"{metric}{_TOKENS}"].tolist()
-    columns = {}
+    columns = {}  # by name: an array for each sample
     for name in arrays_of(like):
         ends = np.cumsum(arrays[f"{metric}/{name}{_LENGTHS}"])
         values = arrays[f"{metric}/{name}"]
@@ -170,7 +192,7 @@ def _evaluator(options: Mapping[str, Any]) -> MapEvaluator:
     for key, value in values.items():
         if isinstance(value, list):  # JSON has no tuples
             values[key] = tuple(value)
-    if values.get("grid"):
+    if values.get("grid"):  # a dictionary of its fields in JSON
         values["grid"] = BEVGrid(**values["grid"])
     settings = MetricSettings(**values)
     points = options["ground_truth_points"]

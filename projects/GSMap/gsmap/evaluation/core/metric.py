@@ -20,7 +20,8 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
 PACKAGE = Path(gsmap.__file__).parent  # folder of GSMap's code
-_CORE_MODULES = {  # modules in evaluation/core, by the first word of the names of their metrics
+# Modules in evaluation/core, by the first word of the names of their metrics.
+_CORE_MODULES = {
     "chamfer": "gsmap.evaluation.core.chamfer_ap",
     "raster": "gsmap.evaluation.core.raster_ap",
 }
@@ -34,7 +35,8 @@ class _SampleFields(NamedTuple):
     ground_truth: MapElements
 
 
-class Sample(_SampleFields):  # a subclass, because a NamedTuple itself cannot cache a property
+# `cached_property` needs a `__dict__`, which a NamedTuple lacks and its subclass has.
+class Sample(_SampleFields):
     """Predictions and ground truth of one sample, in metres in the annotation frame.
 
     Attributes:
@@ -45,7 +47,10 @@ class Sample(_SampleFields):  # a subclass, because a NamedTuple itself cannot c
 
     @cached_property
     def cache(self) -> dict[Any, Any]:
-        """Intermediate results that several metrics share, by the rules that they depend on."""
+        """Intermediate results that several metrics share, by the rules that they depend on.
+
+        The dictionary starts empty, and the metrics fill it.
+        """
         return {}
 
 
@@ -66,11 +71,11 @@ class SampleValues:
 
 _Shape = tuple[int, ...]
 Matches = FrameMatches | SampleValues
-"""Record of one sample that a metric keeps."""
+"""Record of one sample that a metric keeps: matches of predictions, or other arrays."""
 
 
 class ValueTable:
-    """Arrays of many samples, in the order of their tokens."""
+    """Arrays of S samples, in the order of their tokens."""
 
     def __init__(self) -> None:
         self._records: dict[str, SampleValues] = {}
@@ -84,11 +89,11 @@ class ValueTable:
 
     @property
     def tokens(self) -> list[str]:
-        """Tokens of all samples, sorted. (S,)"""
+        """Tokens of the S samples, sorted."""
         return sorted(self._records)
 
     def column(self, name: str) -> list[npt.NDArray[Any]]:
-        """Return the array ``name`` of each sample, in the order of the tokens. (S,)"""
+        """Return the array ``name`` of each of the S samples, in the order of the tokens."""
         return [self._records[token].values[name] for token in self.tokens]
 
 
@@ -101,14 +106,15 @@ class MetricSettings:
         thresholds: Distances up to which a prediction matches, in metres; None for the default of
             each metric. Metrics without distances ignore them.
         dim: Number of coordinates in distances: 2 (x, y) or 3 (x, y, z).
-        resample_predictions: Whether predictions are resampled.
-        resample_ground_truth: Whether ground truth is resampled.
+        resample_predictions: Whether the points of predictions are resampled at equal distances
+            before they are compared.
+        resample_ground_truth: Whether the points of the ground truth are resampled in this way.
         grid: Extent of the map in metres; None if unknown.
         polygon_classes: Names of the classes that are areas; unknown names are allowed.
         min_score: Smallest score of a prediction that counts; None for each metric's default.
 
     Raises:
-        ValueError: If ``classes`` is empty or contains a value that is not a text.
+        ValueError: If ``classes`` is empty, is a single text, or contains a value that is no text.
     """
 
     classes: tuple[str, ...]
@@ -121,6 +127,7 @@ class MetricSettings:
     min_score: float | None = None
 
     def __post_init__(self) -> None:
+        # A frozen dataclass allows no other assignment.
         object.__setattr__(self, "classes", checked_classes(self.classes))
 
     @property
@@ -147,7 +154,8 @@ class MetricSettings:
 class Metric(ABC):
     """Base class of a metric, which ``register_metric`` makes available by its name.
 
-    Subclasses set the rules of a metric as class attributes. Their objects can be pickled.
+    Subclasses set the fixed rules of a metric as class attributes, and `from_settings` sets the
+    others. Their objects can be pickled, because worker processes match samples.
 
     Attributes:
         name: Name of the metric in ``--eval`` and prefix of the keys of its figures.
@@ -173,7 +181,10 @@ class Metric(ABC):
 
     @abstractmethod
     def match(self, sample: Sample) -> Matches:
-        """Compare predictions and ground truth, and return a record without masks or points."""
+        """Compare predictions and ground truth, and return a record without masks or points.
+
+        The records of all samples stay in memory, so they must be small.
+        """
 
     @abstractmethod
     def reports(self, table: Any) -> list[MetricReport]:
@@ -200,6 +211,7 @@ def register_metric(metric: MetricClass) -> MetricClass:
     Raises:
         ValueError: If another metric has this name.
     """
+    # The metric itself, unless its name has been registered before.
     registered = _REGISTERED.setdefault(metric.name, metric)
     first_source = (registered.__module__, registered.__qualname__)
     source = (metric.__module__, metric.__qualname__)
@@ -214,8 +226,8 @@ def register_metric(metric: MetricClass) -> MetricClass:
 def metric_class(name: str) -> type[Metric]:
     """Return the class of a metric by its name.
 
-    If the name is not registered yet, the module that its first words name is imported. For
-    ``chamfer_hard``, this is the module of ``chamfer``.
+    If the name is not registered yet, each module of `metric_files` is imported whose name is equal
+    to the metric's name or to its first words. For ``chamfer_hard``, this is ``chamfer``.
 
     Raises:
         ValueError: If there is no metric of this name.
@@ -261,7 +273,7 @@ def arrays_of(matches: Matches) -> dict[str, npt.NDArray[Any]]:
         return {name: np.asarray(values) for name, values in matches.values.items()}
     arrays = {}
     for name, values in vars(matches).items():
-        if name != "token" and values is not None:
+        if name != "token" and values is not None:  # None: the metric does not have this array
             arrays[name] = np.asarray(values)
     return arrays
 
@@ -283,6 +295,7 @@ def matches_of(token: str, arrays: Mapping[str, npt.NDArray[Any]], like: Matches
         raise InputError(f"shapes {shapes} where an empty sample has {expected}")
     if isinstance(like, SampleValues):
         return SampleValues(token, arrays)
+    # These arrays must have one row for each prediction, so their lengths are equal.
     lengths = {shapes[name][0] for name in _PER_PREDICTION}
     if len(lengths) > 1:
         raise InputError(f"shapes {shapes} where an empty sample has {expected}")

@@ -39,7 +39,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError, InputTypeError
 
-_PRIOR_PROBABILITY = 0.01
+_PRIOR_PROBABILITY = 0.01  # of each class before training, as in RetinaNet
 
 
 @MODELS.register_module()
@@ -73,12 +73,13 @@ class MapHead(LossHead):
         settings: Settings that map models add to every head with `head_setting`.
 
     Raises:
-        TypeError: If a loss is no `MapLoss`.
-        ValueError: If a loss or a cost lacks an input, a class or a loss does not exist, or two
-            parts have one name.
+        TypeError: If a loss is no `MapLoss`, or a setting does not exist.
+        ValueError: If a loss or a cost lacks an input, a class or a loss does not exist, two parts
+            have one name, a setting of the coder does not exist, or a decoder with instance queries
+            gets embeddings of points.
     """
 
-    transforms = ("FormatMapTargets",)
+    transforms = ("FormatMapTargets",)  # steps of the data pipeline that make the targets
 
     def __init__(
         self,
@@ -101,7 +102,8 @@ class MapHead(LossHead):
         **settings: Any,
     ) -> None:
         super().__init__(init_cfg)
-        # A map model may have added a setting from which the config of `point_queries` follows.
+        # A map model may have added a setting from which the config of `point_queries` follows. An
+        # unknown setting raises an error.
         point_queries = resolve_added_settings(settings).get("point_queries", point_queries)
         self.grid = grid
         self.classes = tuple(classes)
@@ -119,6 +121,7 @@ class MapHead(LossHead):
         }
         decoder_class = class_of(decoder) or MapDecoder
         if issubclass(decoder_class, MapDecoder):
+            # Settings of the reference that depend on the decoder.
             reference_defaults.update(decoder_class.reference_settings(num_points))
         self.reference: RefinedReference = build_part(reference, **reference_defaults)
         self.decoder: MapDecoder = build_part(
@@ -134,6 +137,7 @@ class MapHead(LossHead):
                 f"{type(self.decoder).__name__} has instance queries, which need no embeddings of "
                 f"points: leave out {', '.join(settings) or 'point_queries'}."
             )
+        # The first half of the channels is positional, the second half is content.
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
         self.pts_embedding = self._build_point_embedding(point_queries)
         self.cls_branches = nn.ModuleList(
@@ -164,10 +168,10 @@ class MapHead(LossHead):
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Settings of the targets' transform that follow from the settings of the head.
+        """Settings of the transform in ``transforms`` that follow from the settings of the head.
 
         Args:
-            settings: Settings of the head.
+            settings: Settings of the head, with ``num_points``.
         """
         return {"num_points": settings["num_points"]}
 
@@ -180,18 +184,18 @@ class MapHead(LossHead):
         Raises:
             ValueError: If a setting does not exist.
         """
-        kind = self.reference.coder_class or MapCoder
+        coder_class = self.reference.coder_class or MapCoder
         valid_names: set[str] = set()  # of all base classes: subclasses pass settings on to them
-        for base in kind.__mro__:
+        for base in coder_class.__mro__:
             valid_names.update(signature(base).parameters)
         unknown = sorted(set(settings) - valid_names)
         if unknown:
             raise InputError(
-                f"coder.{unknown[0]} is no setting of {kind.__name__}, the coder of "
+                f"coder.{unknown[0]} is no setting of {coder_class.__name__}, the coder of "
                 f"{type(self.reference).__name__}: leave it out, or take a head whose coder has "
                 "this setting."
             )
-        coder: MapCoder = kind(grid=self.grid, **settings)
+        coder: MapCoder = coder_class(grid=self.grid, **settings)
         return coder
 
     def check_parts(self) -> None:
@@ -222,6 +226,7 @@ class MapHead(LossHead):
         check_classes("coder.unfold_classes", self.coder.unfold_classes, classes=self.classes)
         if isinstance(self.loss_cls, ClassLoss):
             self.loss_cls.check(self)
+        # `check` of a part raises an error if the head lacks an input of the part.
         for loss in cast(Any, self.losses.values()):
             loss.check(self)
             check_weight(loss, loss.loss_weight, classes=self.classes)
@@ -251,11 +256,11 @@ class MapHead(LossHead):
         Returns:
             Two tensors (N * P, C) for point queries, or (N, C) for instance queries.
         """
-        embeddings = self.instance_embedding.weight
+        embeddings = self.instance_embedding.weight  # (N, 2 C)
         if not self.training:
             embeddings = embeddings[: self.query_groups[0].num]
         if self.pts_embedding is not None:
-            embeddings = self.pts_embedding(embeddings).flatten(0, 1)
+            embeddings = self.pts_embedding(embeddings).flatten(0, 1)  # (N * P, 2 C)
         return embeddings[:, : self.embed_dims], embeddings[:, self.embed_dims :]
 
     def attention_mask(self) -> Tensor | None:
@@ -288,10 +293,11 @@ class MapHead(LossHead):
         num_predicting = self.query_groups[0].num
         if loaded is None or loaded.shape == initial.shape:
             return
-        if len(loaded) < num_predicting:  # too few queries: the state cannot be made to fit
+        # With too few queries, the state cannot be made to fit, and torch reports the shapes.
+        if len(loaded) < num_predicting:
             return
         common = loaded[: len(initial)]
-        missing = initial.detach()[len(common) :].to(common)
+        missing = initial.detach()[len(common) :].to(common)  # empty if the checkpoint has more
         state[key] = torch.cat([common, missing])
         print_log(
             f"{key}: the checkpoint has {len(loaded)} instance queries, the model "
@@ -323,6 +329,8 @@ class MapHead(LossHead):
         for hook in hooks:
             start = hook.start(self, start)
 
+        # After each layer, the decoder calls `refine` for the new references, and then `between`
+        # for the queries of the next layer.
         def refine(layer: int, states: Tensor, reference: Tensor) -> Tensor:
             refined = self.reference.refine(layer, states, reference)
             for hook in hooks:
@@ -397,7 +405,8 @@ class MapHead(LossHead):
             bev_outputs: Outputs of the BEV encoder, with ``bev_feats`` (B, C, H, W).
             batch_data_samples: Samples with ground truth.
             hooks: Hooks into the flow of the queries, called after the hooks of ``flow_parts``.
-            layers: Predictions of each layer, if the head has already been run without hooks.
+            layers: Predictions of each layer, if the head has already been run without hooks. None
+                runs the head.
 
         Returns:
             Scalars by name.

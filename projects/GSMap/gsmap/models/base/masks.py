@@ -48,6 +48,7 @@ class ElementMasks:
         if source not in self.sources:
             raise InputError(f"source must be one of {self.sources}, got {source!r}.")
         longer_m = max(grid.extent_m)
+        # Grids of this extent with other pixels. `rasterized` checks that they divide the map.
         self.grid = grid.rasterized(pixel_m or longer_m / 200)
         self.cost_grid = grid.rasterized(cost_pixel_m or longer_m / 128)
         self.line_width_m = line_width_m
@@ -80,7 +81,7 @@ class ElementMasks:
         """Draw map elements as bands or filled polygons.
 
         Args:
-            polylines: Points in metres. (K, M, 2 or 3)
+            polylines: Points in metres, M of each element; heights are ignored. (K, M, 2 or 3)
             labels: Class indices. (K,)
             grid: The raster.
 
@@ -89,6 +90,7 @@ class ElementMasks:
         """
         filled = None
         if self.filled_classes:
+            # `constant` makes a tensor on the device of `labels`, and caches it.
             filled = torch.isin(labels, constant(labels, self.filled_classes))
         return draw_polylines(
             polylines[..., :2].float(), grid, width_m=self.line_width_m, filled=filled
@@ -98,10 +100,13 @@ class ElementMasks:
         """References for the rendering of predicted masks; a subclass may stop gradients here.
 
         Args:
-            references: References of the decoder, whose first ``coords`` entries are the
-                coordinates of a point. (M, P, D)
+            references: References of M matched predictions, from the decoder. The first ``coords``
+                entries are the coordinates of a point. (M, P, D)
             labels: Class indices of the matched ground truths. (M,)
             coords: Number of coordinates of a point.
+
+        Returns:
+            References for the rendering. (M, P, D)
         """
         return references
 
@@ -109,7 +114,9 @@ class ElementMasks:
         """Draw the ground truth of a batch before the matching.
 
         Args:
-            gt_instances: Ground truth of each sample.
+            gt_instances: Ground truth of each sample: ``labels_3d`` (K,), and in metres the points
+                ``pts`` (K, P, 2 or 3) or, for the source ``"full"``, ``polylines`` (K, M, 2 or 3).
+                K and M differ between samples.
             grid: The raster.
 
         Returns:
@@ -134,7 +141,10 @@ class ElementMasks:
 
 
 def _pad_lines(lines: Tensor, length: int) -> Tensor:
-    """Pad lines to a length with their last points. (K, M, 2 or 3) -> (K, length, 2 or 3)"""
+    """Pad lines to a number of points. (K, M, 2 or 3) -> (K, length, 2 or 3)
+
+    The last point is repeated, which does not change the drawn line.
+    """
     if not len(lines):  # such lines may have M = 0, without a last point
         return lines.new_zeros(0, length, lines.shape[2])
     num_missing = length - lines.shape[1]

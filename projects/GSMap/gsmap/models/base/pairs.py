@@ -33,7 +33,8 @@ class Predictions:
         scores: Class logits. (B, N, classes)
         decoded: Output of the decoder layer, with states and references.
         bev_feats: BEV features. (B, C, H, W)
-        reference: Module that decodes ``decoded.references`` to points, metres and masks.
+        reference: Module that converts ``decoded.references`` to points and masks, and normalised
+            points to metres.
         masks: Settings and rasters of the masks in losses and in matching costs.
 
     Attributes:
@@ -60,7 +61,7 @@ class Predictions:
 
     @property
     def layers(self) -> Sequence["Predictions"]:
-        """Predictions of each of the L layers."""
+        """Predictions of each of the L layers; only the object itself if it is of one layer."""
         return self._layers or [self]
 
     @classmethod
@@ -68,7 +69,7 @@ class Predictions:
         """Concatenate the predictions of several layers along the queries."""
         if len(layers) == 1:
             return layers[0]
-        last = layers[-1]
+        last = layers[-1]  # BEV features, reference and masks are equal in all layers
         scores = torch.cat([layer.scores for layer in layers], dim=1)
         decoded = JoinedDecoded([layer.decoded for layer in layers])
         all_layers = cls(
@@ -87,7 +88,7 @@ class Predictions:
         return self.reference.render(self.references.detach(), self.masks.cost_grid)
 
     def of_queries(self, queries: slice) -> "Predictions":
-        """Predictions of some of the instance queries, with scores in float32."""
+        """Predictions of some instance queries, such as one group, with scores in float32."""
         return Predictions(
             scores=self.scores[:, queries].float(),
             decoded=self.decoded.of_queries(queries),
@@ -115,7 +116,7 @@ class GroundTruth:
 
     Attributes:
         counts: Number K of elements of each sample.
-        first: Index of the first element of each sample among all elements.
+        first: Index of the first element of each sample among the T elements.
         labels: Class indices. (T,)
         pts_shifts: Points in all equivalent orders, [0, 1] over the map. (T, S, P, 2 or 3)
     """
@@ -195,12 +196,15 @@ class SampleView:
         self._rows = rows
 
     def __getattr__(self, name: str) -> Tensor:
+        # Python calls this method for attributes that the view does not have.
         values: Tensor = getattr(self._batch, name)[self._rows]
         return values
 
 
 class MapMatches(NamedTuple):
     """Indices of the matched pairs of L layers, each with M pairs sorted by sample and query.
+
+    All layers have equally many queries and ground truths, and therefore equally many pairs.
 
     Attributes:
         samples: Index of the sample in the batch. (L, M)
@@ -209,7 +213,8 @@ class MapMatches(NamedTuple):
         gt_inds: Index of the ground truth in its sample. (L, M)
         rows: Index of the ground truth among all T elements of the batch. (L, M)
         order_inds: Index of the closest equivalent point order of the ground truth. (L, M)
-        host_labels: Class index of the ground truth, kept on the CPU. (L, M)
+        host_labels: Class index of the ground truth, kept on the CPU, where reading it does not
+            wait for the GPU. (L, M)
         counts: Number of pairs of each sample, in one layer: B integers.
     """
 
@@ -268,27 +273,31 @@ class MatchedPairs:
         self._layer_pairs: dict[int, MatchedPairs] = {}
 
     def layer(self, number: int) -> "MatchedPairs":
-        """Pairs of one layer. Cached properties of all pairs are reused, not computed again.
+        """Pairs of one layer.
+
+        Cached properties of all pairs are reused and not computed again. Repeated calls return one
+        object for each layer.
 
         Args:
             number: Index of the layer. Negative indices count from the last layer.
         """
         if self.num_layers == 1:
             return self
-        number %= self.num_layers
+        number %= self.num_layers  # -1 becomes the index of the last layer
         if number not in self._layer_pairs:
             self._layer_pairs[number] = self._select_layer(number)
         layer_pairs = self._layer_pairs[number]
-        # Cached properties that have been computed are in `vars`. Copy their part of the layer.
+        # `cached_property` stores a computed value in `vars` under its name. Writing the part of
+        # the layer to `vars(layer_pairs)` fills the cache of the layer.
         for name, values in vars(self).items():
-            is_cached = isinstance(getattr(type(self), name, None), cached_property)
-            if is_cached and name not in vars(layer_pairs):
+            is_property = isinstance(getattr(type(self), name, None), cached_property)
+            if is_property and name not in vars(layer_pairs):
                 vars(layer_pairs)[name] = self.by_layer(values)[number]
         return layer_pairs
 
     def _select_layer(self, number: int) -> "MatchedPairs":
         """Pairs of one of several layers."""
-        row = slice(number, number + 1)
+        row = slice(number, number + 1)  # keeps the axis of layers, with length 1
         matches = MapMatches(
             samples=self._matches.samples[row],
             query_inds=self._matches.query_inds[row],

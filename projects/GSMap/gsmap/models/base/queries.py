@@ -10,7 +10,7 @@ from gsmap.models.base.parts import PartConfig
 # Function from the value of an added setting to the settings of `MapHead` that implement it.
 HeadSetting = Callable[[Any], PartConfig]
 
-_ADDED_SETTINGS: dict[str, HeadSetting] = {}
+_ADDED_SETTINGS: dict[str, HeadSetting] = {}  # by name; `head_setting` adds to it at imports
 
 
 class PointTable(nn.Embedding):
@@ -18,8 +18,8 @@ class PointTable(nn.Embedding):
 
     Args:
         num_points: Points per instance P.
-        embed_dims: Channels C of a query. An embedding has 2 C channels: C for the query and C for
-            its positional encoding.
+        embed_dims: Channels C of a query. An embedding has 2 C channels: C for the content of the
+            query and C for its positional encoding.
     """
 
     def __init__(self, num_points: int, embed_dims: int) -> None:
@@ -61,6 +61,8 @@ def resolve_added_settings(values: PartConfig) -> PartConfig:
     head_settings: PartConfig = {}
     for name, value in values.items():
         if name not in _ADDED_SETTINGS:
+            # The text is Python's text for an unknown argument, because the settings are further
+            # keyword arguments of `MapHead`.
             raise TypeError(f"MapHead.__init__() got an unexpected keyword argument '{name}'")
         setting = _ADDED_SETTINGS[name]
         head_settings.update(setting(value))

@@ -47,6 +47,9 @@ class CurveReference(Reference):
 class BezierHead(LineHead):
     """Head of Bezier curves with a degree and a largest number of pieces per class (BeMapNet).
 
+    A curve of k pieces of degree d has k + 1 joints, the ends of its pieces, and d - 1 inner
+    control points in each piece.
+
     Args:
         grid: Extent of the map, in metres.
         classes: Names of the classes.
@@ -69,8 +72,8 @@ class BezierHead(LineHead):
     """
 
     transforms = ("FormatBezierTargets",)
-    targets = "control points"
-    level_weights = (0.5, 0.8, 1.2, 1.8)
+    targets = "control points"  # for error messages
+    level_weights = (0.5, 0.8, 1.2, 1.8)  # of the losses of class masks, by BEV level
     losses: BezierLosses
 
     def __init__(
@@ -99,6 +102,7 @@ class BezierHead(LineHead):
             grid,
             classes,
             numbers=queries,
+            # One group of lines for all classes together, with one point query per line.
             decoder={"queries": [(sum(queries), 1)], **(decoder or {})},
             losses=BezierLosses(**(losses or {})),
             embed_dims=embed_dims,
@@ -112,19 +116,20 @@ class BezierHead(LineHead):
         self.joint_branches = nn.ModuleList()
         self.inner_branches = nn.ModuleList()
         self.piece_branches = nn.ModuleList()
-        coordinates = 2 * self.point_dims
-        for degree, number in zip(degrees, pieces, strict=True):
-            self.curves.append(Curve(degree, number, to_end=to_end))
-            joint_dims = (number + 1) * coordinates
+        dims_per_point = 2 * self.point_dims  # D channels for each of the two coordinates
+        # Three loops, because the order of creation determines the random initial weights.
+        for degree, num_pieces in zip(degrees, pieces, strict=True):
+            self.curves.append(Curve(degree, num_pieces, to_end=to_end))
+            joint_dims = (num_pieces + 1) * dims_per_point
             self.joint_branches.append(mlp(embed_dims, hidden_dims, hidden_dims, joint_dims))
-        for degree, number in zip(degrees, pieces, strict=True):
+        for degree, num_pieces in zip(degrees, pieces, strict=True):
             inner_branch: nn.Module = nn.Identity()  # curves of degree 1 have no inner points
             if degree > 1:
-                inner_dims = number * (degree - 1) * coordinates
+                inner_dims = num_pieces * (degree - 1) * dims_per_point
                 inner_branch = mlp(embed_dims, hidden_dims, hidden_dims, inner_dims)
             self.inner_branches.append(inner_branch)
-        for number in pieces:
-            self.piece_branches.append(mlp(embed_dims, hidden_dims, hidden_dims, number))
+        for num_pieces in pieces:
+            self.piece_branches.append(mlp(embed_dims, hidden_dims, hidden_dims, num_pieces))
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -181,16 +186,16 @@ class BezierHead(LineHead):
             the numbers of pieces (B, n, k).
         """
         degree = cast(Curve, self.curves[label]).degree
-        coordinates = (2, self.point_dims)
+        point_shape = (2, self.point_dims)  # D channels for each of the two coordinates
         joint_feats = self.joint_branches[label](states).float()
-        joints = joint_feats.unflatten(-1, (-1, *coordinates)) @ mean
+        joints = joint_feats.unflatten(-1, (-1, *point_shape)) @ mean
         pieces = self.piece_branches[label](states).float()
-        shape = (pieces.shape[-1], degree - 1)
+        inner_shape = (pieces.shape[-1], degree - 1)  # (k, d - 1)
         if degree == 1:
-            inner = joints.new_zeros((*pieces.shape[:2], *shape, 2))
+            inner = joints.new_zeros((*pieces.shape[:2], *inner_shape, 2))  # an empty tensor
         else:
             inner_feats = self.inner_branches[label](states).float()
-            inner = inner_feats.unflatten(-1, (*shape, *coordinates)) @ mean
+            inner = inner_feats.unflatten(-1, (*inner_shape, *point_shape)) @ mean
         return joints, inner, pieces
 
     def build_lines(
@@ -231,6 +236,7 @@ class BezierHead(LineHead):
             ValueError: If the sample has no targets, or targets that do not fit the head.
         """
         instances = self.line_targets(sample)
+        # The grid returns the distance from the front first. Control points have it second.
         points = self.grid.front_from_metres(instances.pts.float()).flip(-1)
         truths = []
         for label, curve in enumerate(cast(Iterable[Curve], self.curves)):
@@ -238,6 +244,7 @@ class BezierHead(LineHead):
             counts = instances.num_pts[is_class]  # numbers of control points
             largest = curve.weights.shape[-1]  # largest number of control points of a curve
             has_too_many = counts > largest
+            # Complete pieces have a multiple of the degree plus one control points.
             has_half_pieces = (counts - 1) % curve.degree != 0
             if (has_too_many | has_half_pieces).any():
                 raise InputError(
@@ -247,6 +254,7 @@ class BezierHead(LineHead):
                 )
             piece_index = (counts - 1) // curve.degree - 1  # number of pieces less one
             num_missing = max(largest - points.shape[1], 0)
+            # All lines get `largest` control points. The unused ones are set to 0.
             controls = F.pad(points[is_class, :largest], (0, 0, 0, num_missing))
             controls = controls * curve.control_mask(piece_index)[..., None]
             curves = curve(controls, piece_index)

@@ -1,7 +1,9 @@
 """Mapping between the state keys of the released BeMapNet and of this project.
 
-`rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
-Each word of the text continues both prefixes: ``released=here``, or one name for both.
+A rule is a pair of key prefixes, (released, here), in which ``{i}`` stands for any number.
+`rules_of` makes several rules. It takes the common prefix of released keys, the common prefix of
+the keys here, and a text. Each word of the text continues both prefixes: ``released=here``, or one
+name for both. `mlps` makes the rules of the linear layers of an MLP from its two prefixes.
 """
 
 from collections.abc import Sequence
@@ -17,9 +19,12 @@ from gsmap.models.lines.keys import (
     mlps,
 )
 
-_NECK = "im_backbone.fpn.model."
+_NECK = "im_backbone.fpn.model."  # prefix of the neck (a BiFPN) in the release
+# Words for `rules_of`: the layers of a separable convolution of the neck.
 _CONVS = "depthwise_conv.conv.=depthwise. pointwise_conv.conv.=pointwise. bn.=norm."
-_PROJECTIONS = {  # names in the release, and their names here
+# Convolutions that project backbone features to the channels of the neck: names in the release, and
+# their names here.
+_PROJECTIONS = {
     "p3_down_channel.": "inputs.0.",
     "p4_down_channel.": "inputs.1.",
     "p5_down_channel.": "inputs.2.",
@@ -36,7 +41,7 @@ def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]
         path: Name of the path, ``down`` or ``up``.
         release_path: Name of the path in the release.
         number: Number of the path in the names of the fusion weights of the release.
-        levels: Levels in the order of the path.
+        levels: Numbers of the levels of the pyramid in the order of the path.
     """
     rules: list[tuple[str, str]] = []
     for i, level in enumerate(levels):
@@ -50,7 +55,10 @@ def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]
 
 
 def _projection_rules() -> Rules:
-    """Return the rules of the projections. The release nests their convolutions deeper."""
+    """Return the rules of the projections: a convolution, and the batch norm after it.
+
+    In the release, the convolution is within one more module (``0.conv.`` instead of ``0.``).
+    """
     rules: list[tuple[str, str]] = []
     for theirs, ours in _PROJECTIONS.items():
         rules.append((f"{_NECK}0.{theirs}0.conv.", f"img_neck.{ours}0."))
@@ -98,7 +106,7 @@ BEMAPNET = KeyMap(
         *mlps("output_head.npiece_heads.{i}.", "map_head.piece_branches.{i}."),
         *HEAD_RULES,
     ),
-    unused=CLASS_WEIGHTS,
+    unused=CLASS_WEIGHTS,  # released keys without a counterpart here
     # Key prefixes, in the release and here, that distinguish this architecture from others.
     markers=((_NECK, "img_neck.rounds."),),
     # The release saves the weights of `src_pos_embed_layer` a second time under this name.

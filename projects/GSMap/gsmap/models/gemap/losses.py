@@ -28,6 +28,7 @@ def shape_features(points: Tensor) -> Tensor:
     Returns:
         Length, cosine, sine. (3, ..., P)
     """
+    # With x and y along the first axis, sums over the coordinates are fast.
     edges = _edges(points.movedim(-1, 0))
     lengths = edges.norm(dim=0)
     previous_edges = edges.roll(1, -1)
@@ -41,13 +42,14 @@ def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
 
     Args:
         points: Normalised points of M elements. (..., M, P, 2)
-        pairs: Indices of the first and the second element of R pairs. (2, R)
+        pairs: Indices (into M) of the first and the second element of R pairs. (2, R)
 
     Returns:
-        Distance of two points, cosine and sine of the angle between two edges; the last two axes
-        are the points (or edges) of the first and of the second element. (3, ..., R, P, P)
+        Along the first axis: distance of two points, and cosine and sine of the angle between two
+        edges. The last two axes are the points (or edges) of the first and of the second element.
+        (3, ..., R, P, P)
     """
-    points = points.movedim(-1, 0)  # sums over a last axis of two would be slow
+    points = points.movedim(-1, 0)  # as in `shape_features`
     edges = _edges(points)
     lengths = edges.norm(dim=0)
     first = (..., pairs[0], slice(None), None)  # selects (2, ..., R, P, 1)
@@ -101,12 +103,14 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     weights: list[float] = []
     first = 0
     for count in counts:
+        # Pairs i < j of the elements of the sample, as indices into all M elements.
         sample_pairs = torch.triu_indices(count, count, 1) + first
         pairs.append(sample_pairs)
         weight = 1 / max(count, 1) ** 2
         weights += [weight] * sample_pairs.shape[1]
         first += count
     host_tensors = [torch.cat(pairs, dim=1), torch.tensor(weights, dtype=pred.dtype)]
+    # Copies to the device of `pred`, without waiting for its work.
     pair_indices, pair_weights = upload(host_tensors, pred.device)
     pred_relations = relation_features(pred, pair_indices)
     target_relations = relation_features(target, pair_indices)
@@ -123,7 +127,7 @@ class EuclideanLoss(MapLoss):
         loss_weight: Weight of the loss (lambda in Table A1 of the supplement).
         shape_weight: Weight of the shapes within the loss.
         relation_weight: Weight of the relations within the loss.
-        flags: As in `MapLoss`.
+        flags: Flags ``last_layer_only`` and ``first_group_only`` of `MapLoss`.
     """
 
     name = "euclidean"
@@ -140,7 +144,7 @@ class EuclideanLoss(MapLoss):
         self.relation_weight = relation_weight
 
     def by_layer(self, pairs: MatchedPairs) -> Tensor:
-        """Weighted loss of each decoder layer. Heights are ignored."""
+        """Weighted loss of each decoder layer. Heights are ignored. (L,)"""
         # The M pairs are ordered by decoder layer, and each of the L layers has equally many pairs.
         pred = pairs.by_layer(pairs.pred_pts[..., :2])  # (L, M / L, P, 2)
         target = pairs.by_layer(pairs.gt_pts[..., :2])
@@ -154,12 +158,18 @@ class EuclideanLoss(MapLoss):
 
 
 def _edges(points: Tensor) -> Tensor:
-    """Edges that end in each point; the first one closes the ring. (2, ..., P)"""
+    """Edges that end in each point; the first one comes from the last point. (2, ..., P)"""
     return points - points.roll(1, -1)
 
 
 def _turns(first: Tensor, second: Tensor, products: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine of the angle between edges (2, ...), from the products of their lengths."""
+    """Cosine and sine of the angle from the first to the second edges.
+
+    Args:
+        first: First edges. (2, ...)
+        second: Second edges. (2, ...)
+        products: Products of the lengths of both edges. (...)
+    """
     dot = first[0] * second[0] + first[1] * second[1]
     cross = first[0] * second[1] - first[1] * second[0]
     scale = 1 / (products + NORM_EPS)

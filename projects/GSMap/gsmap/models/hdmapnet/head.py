@@ -74,7 +74,7 @@ class HDMapNetHead(DetectionHead):
         self.random_start = random_start
         self.losses = LineMapLosses(**(losses or {}))
         self.num_directions = num_directions
-        degrees = 360 // num_directions
+        degrees = 360 // num_directions  # angle between neighbouring directions
         vectorize_settings = {"degrees": degrees}
         vectorize_settings.update(vectorizing or {})
         self.vectorizing = VectorizeConfig(**vectorize_settings)
@@ -126,7 +126,7 @@ class HDMapNetHead(DetectionHead):
         device = maps.semantic.device
         line_numbers = [self.target(sample, "gt_lines") for sample in batch_data_samples]
         directions = [self.target(sample, "gt_directions") for sample in batch_data_samples]
-        with torch.autocast(device.type, enabled=False):
+        with torch.autocast(device.type, enabled=False):  # losses are computed in float32
             return self.losses(
                 maps,
                 numbers=torch.stack(line_numbers).to(device),
@@ -141,6 +141,9 @@ class HDMapNetHead(DetectionHead):
             name: ``gt_lines`` (classes, rows, columns) with the number of the line at each pixel,
                 or ``gt_directions`` (2, rows, columns) with the forward and the backward direction
                 of that line, 1 to ``num_directions``. Both are 0 at pixels without a line.
+
+        Returns:
+            The target as integers, on the device of the sample.
 
         Raises:
             ValueError: If the sample has no such target, or if it does not fit the head.
@@ -185,9 +188,11 @@ class HDMapNetHead(DetectionHead):
 
     def lines(self, maps: LineMaps) -> InstanceData:
         """Trace the lines of one sample's maps, the highest score first. (channels, H, W) each"""
+        # Function from a number of points to the index of the first traced point; None for index 0.
         choose_start: Callable[[int], int] | None = None
         if self.random_start:
             choose_start = random.randrange
+        # Each traced line has a label, a score, and its points as pixels (column, row).
         traced_lines = vectorize(
             maps.semantic,
             maps.embedding,
@@ -195,7 +200,7 @@ class HDMapNetHead(DetectionHead):
             config=self.vectorizing,
             choose_start=choose_start,
         )
-        lines = [line for line in traced_lines if len(line.pixels) > 1]
+        lines = [line for line in traced_lines if len(line.pixels) > 1]  # one point is no line
         lines.sort(key=lambda line: -line.score)
         # The centre of pixel (column, row) is at (column + 0.5, row + 0.5).
         pts = pad_lines([metres_from_pixels(line.pixels + 0.5, self.grid) for line in lines])

@@ -17,7 +17,8 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
 
     Args:
         pts: Normalised points of the predictions. (N, P, 2 or 3)
-        pts_shifts: Normalised points of the ground truths, in S equivalent orders.
+        pts_shifts: Normalised points of the ground truths, in S equivalent orders: an element is
+            unchanged if its points are reversed, or if the points of a ring are rotated.
             (K, S, P, 2 or 3)
 
     Returns:
@@ -33,6 +34,7 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
             "and in the pipeline."
         )
     num_gts, num_orders = pts_shifts.shape[:2]
+    # Distances between vectors with all coordinates of an element. (N, K * S)
     distances = torch.cdist(pts.flatten(1), pts_shifts.flatten(0, 1).flatten(1), p=1)
     return distances.view(len(pts), num_gts, num_orders)
 
@@ -40,6 +42,8 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
 @TASK_UTILS.register_module()
 class OrderedPointsCost(PointsCost):
     """L1 distance to the closest equivalent point order (MapTR Eq. 5).
+
+    As a `PointsCost`, it also selects the point order with which losses compare a matched pair.
 
     Args:
         weight: Weight of the cost, or a weight for each class.
@@ -51,12 +55,12 @@ class OrderedPointsCost(PointsCost):
     def __call__(
         self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
-        """Weighted distances between predictions and ground truths.
+        """Weighted distances between predictions and ground truths, in normalised coordinates.
 
         Args:
             pred_instances: Predictions with normalised ``pts`` (N, P, 2).
             gt_instances: Ground truths with ``pts_shifts`` (K, S, P, 2) and ``labels`` (K,).
-            img_meta: Meta dict of the sample, not used.
+            img_meta: Meta dict of the sample, not used. All matching costs have this argument.
 
         Returns:
             The costs. (N, K)

@@ -1,5 +1,7 @@
 """Mapping between the state keys of the released MapTRv2 and of this project.
 
+The conversion of checkpoints in both directions reads `KEY_MAPS`.
+
 `rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
 Each word of the text continues both prefixes: ``released=here``, or one name for both. `zeros`
 lists keys of the release that have no effect there, and no counterpart here.
@@ -12,7 +14,8 @@ from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 from gsmap.models.maptr.keys import CODE_WEIGHTS, COMMON_RULES, DECODER_LAYER, ENCODER, HEAD, LAYER
 
 MASK_RULES = rules_of(HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg.")
-# Weight of the foreground in a mask loss; here a setting of the config.
+# Weight of the foreground in a mask loss. The release stores it in the checkpoint; here it is a
+# setting of the config.
 MASK_WEIGHTS = {
     HEAD + "loss_seg.loss_fn.pos_weight": torch.tensor((4.0,)),
     HEAD + "loss_pv_seg.loss_fn.pos_weight": torch.tensor((1.0,)),
@@ -24,6 +27,7 @@ LIFTED_RULES = (
     *MASK_RULES,
     *rules_of(ENCODER, "bev_encoder.", "depth_net. downsample."),
 )
+# Keys of the release without a counterpart here, and their values in a conversion to the release.
 LIFTED_UNUSED: dict[str, Tensor | None] = {
     **CODE_WEIGHTS,
     # Modules of another encoder, with learned BEV queries. The release has them but never calls
@@ -50,7 +54,7 @@ LIFTED_UNUSED: dict[str, Tensor | None] = {
     ENCODER + "nx": torch.tensor((200.0, 400.0, 1.0)),
     **MASK_WEIGHTS,
 }
-# Key prefixes (release, here) by which a checkpoint of these models is recognised.
+# Key prefixes (release, here) by which a checkpoint of these models is recognised, in either form.
 LIFTED_MARKER = (ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
 
 MAPTRV2 = KeyMap(
@@ -60,6 +64,9 @@ MAPTRV2 = KeyMap(
         *rules_of(
             DECODER_LAYER,
             LAYER,
+            # The release has two self-attentions, between instances and between points, each with a
+            # norm behind it. Here both belong to `self_attn`, with the norm between them, so the
+            # numbers of the other norms are smaller by one.
             "attentions.0.attn.=self_attn.instance_attn. attentions.1.attn.=self_attn.point_attn. "
             "attentions.2.=cross_attn. ffns.0.=ffn. "
             "norms.0.=self_attn.norm. norms.1.=norms.0. norms.2.=norms.1. norms.3.=norms.2.",

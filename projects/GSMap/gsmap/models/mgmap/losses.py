@@ -30,7 +30,7 @@ class QueryMaskLoss(MapLoss):
     """
 
     name = "ins"
-    transforms = ("MakeInstanceMasks",)
+    transforms = ("MakeInstanceMasks",)  # step of the data pipeline that makes the masks
 
     def __init__(self, loss_weight: float = 1.0, dice_weight: float = 2.0, **flags: bool) -> None:
         super().__init__(loss_weight, **flags)
@@ -59,6 +59,7 @@ class QueryMaskLoss(MapLoss):
         decoded = cast(MaskedDecoded, pairs.predictions.decoded)
         logits = decoded.mask_logits.float()  # (B, N, H, W)
         matched_logits = pairs.of_queries(logits)  # (M, H, W)
+        # Masks of the matched ground truths, in the type of the logits. (M, H, W)
         masks = pairs.of_truths(pairs.truths.pipeline_masks).to(matched_logits)
         check_same_shape(logits=matched_logits, gt_masks=masks)
         targets = torch.zeros_like(logits)
@@ -81,11 +82,13 @@ class ForegroundLoss(MapLoss):
     """
 
     name = "seg"
-    transforms = ("MakeInstanceMasks",)
+    transforms = ("MakeInstanceMasks",)  # step of the data pipeline that makes the masks
 
     def __init__(
         self, loss_weight: float = 1.0, dice_weight: float = 15.0, pos_weight: float = 4.0
     ) -> None:
+        # Only refinement stages, which follow the decoder layers, have a segmentation. All queries
+        # share it, so one query group is enough.
         super().__init__(loss_weight, last_layer_only=True, first_group_only=True)
         self.dice_weight = dice_weight
         self.pos_weight = pos_weight
@@ -104,12 +107,13 @@ class ForegroundLoss(MapLoss):
         decoded = cast(RefinedDecoded, pairs.predictions.decoded)
         logits = decoded.segmentation.float()  # (B, 2, H, W)
         targets = []
+        # `truths.counts` has the number of elements of each sample.
         for masks in pairs.truths.pipeline_masks.split(pairs.truths.counts):
-            foreground = masks.bool().any(dim=0)
+            foreground = masks.bool().any(dim=0)  # (H, W)
             targets.append(torch.stack([foreground, ~foreground]))
         target = torch.stack(targets).to(logits)
         check_same_shape(logits=logits, gt_masks=target)
-        weight = constant(logits, self.pos_weight)
+        weight = constant(logits, self.pos_weight)  # tensor on the device, made once
         cross_entropy = F.binary_cross_entropy_with_logits(logits, target, pos_weight=weight)
         dice = dice_loss(logits.sigmoid(), target)
         return self.loss_weight * cross_entropy + self.dice_weight * dice

@@ -18,7 +18,9 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
     """Decoder layer of instance and point queries with `MultiGranularityAttention` to the BEV.
 
     It consists of the self-attention of the instances, the attention to the BEV features, a
-    feed-forward network for the instance queries, and another one for the point queries.
+    feed-forward network for the instance queries, and another one for the point queries. A
+    reference has D entries for each point: its position (x, y) first, and further ones, such as the
+    size of a Gaussian, if the head predicts them.
 
     Args:
         embed_dims: Channels C of the queries.
@@ -90,6 +92,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         state = self.update_instances(
             state, query_pos, reference=reference, feats=feats, attn_mask=attn_mask
         )
+        # As in mmcv, the residual is added within the feed-forward network.
         return state._replace(points=self.point_norm(self.point_ffn(state.points)))
 
     def update_instances(
@@ -112,10 +115,11 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         Returns:
             Updated queries.
         """
-        position = self.guide_position(query_pos, reference)
-        attention_output = self.self_attn(state.instances, position, attn_mask)
+        self_attn_position = self.guide_position(query_pos, reference)
+        attention_output = self.self_attn(state.instances, self_attn_position, attn_mask)
         state = state._replace(instances=self.norms[0](attention_output))
         by_instance = reference.unflatten(1, (-1, self.num_points))  # (B, N, P, D)
+        # The attention to the BEV uses an encoding of the references instead, if the layer has one.
         position = query_pos
         if self.reference_code is not None:
             encoded_entries = by_instance[..., : self.reference_dims]
@@ -125,6 +129,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             # Each level halves both sides, so all levels share the rotations of the finest one.
             frames = self.guidance.frames(reference, feats[0])
         position = self.guide_position(position, reference)
+        # Updates the instance queries and the point queries.
         state = self.cross_attn(state, position, reference=by_instance, feats=feats, frames=frames)
         instances = self.ffn(self.norms[1](state.instances))
         return state._replace(instances=self.norms[2](instances))
@@ -211,6 +216,7 @@ class MGMapNetDecoder(MapDecoder):
             Queries, references of the points (B, N * P, D), and levels of BEV features.
         """
         references = reference.repeat_interleave(self.num_points, dim=1)
+        # Point queries are None here. The attention of the first layer creates them.
         return Granularities(query), references, self.bev_pyramid(bev_feats)
 
     def point_states(self, state: Granularities) -> Tensor:
@@ -219,10 +225,10 @@ class MGMapNetDecoder(MapDecoder):
         return state.points.flatten(1, 2)
 
     def read(self, state: Granularities, references: Tensor) -> MGMapNetDecoded:
-        """Return the output of a layer.
+        """Return the output of a layer, with values of points by instance.
 
         Args:
-            state: Queries after the layer.
+            state: Queries after the layer, with point queries.
             references: Refined references of the points. (B, N * P, D)
         """
         assert state.points is not None

@@ -55,14 +55,19 @@ class PivotReference(Reference):
 
 
 def pack_lines(lines: list[Lines]) -> LinePredictions:
-    """Join the lines of all classes to predictions. The ends of a line are always pivots."""
+    """Join the lines of all classes to predictions. The ends of a line are always pivots.
+
+    A reference is a point (u, v) with the logit of being a pivot, for `PivotReference.decode`. The
+    classes have different numbers of points p, so all lines are filled to the largest number P.
+    """
     longest = max(class_lines.points.shape[2] for class_lines in lines)
     references = []
     logits = []
     for class_lines in lines:
-        point_logits = class_lines.point_logits  # of being a pivot, and of being none, (B, n, p, 2)
+        # One logit of being a pivot, at the index `PIVOT`, and one of being no pivot. (B, n, p, 2)
+        point_logits = class_lines.point_logits
         pivot_logit = point_logits[..., PIVOT, None] - point_logits[..., 1 - PIVOT, None]
-        ends = torch.ones_like(pivot_logit[:, :, :1])
+        ends = torch.ones_like(pivot_logit[:, :, :1])  # any positive logit makes a pivot
         pivot_logit = torch.cat([ends, pivot_logit[:, :, 1:-1], ends], dim=2)  # (B, n, p, 1)
         reference = torch.cat([class_lines.points, pivot_logit], dim=-1)  # (B, n, p, 3)
         num_missing = longest - reference.shape[2]
@@ -81,7 +86,7 @@ class PivotHead(LineHead):
     Args:
         grid: Extent of the map, in metres.
         classes: Names of the classes.
-        queries: Number of lines, and number of points of each line, for each class.
+        queries: Number of lines and number of points of each line, as a pair for each class.
         decoder: Settings of `PointLineDecoder`.
         losses: Settings of `PivotLosses`.
         embed_dims: Channels C of the points and of the BEV features.
@@ -165,20 +170,20 @@ class PivotHead(LineHead):
             ValueError: If the sample has no targets, or targets that do not fit the head.
         """
         instances = self.line_targets(sample)
-        pivots = self.grid.front_from_metres(instances.pts.float())
+        pivots = self.grid.front_from_metres(instances.pts.float())  # (u from front, v from left)
         truths = []
         for label, (_, num_points) in enumerate(self.decoder.queries):
             is_class = instances.labels_3d == label
-            numbers = instances.num_pts[is_class]
-            if (numbers > num_points).any():
+            num_pivots = instances.num_pts[is_class]
+            if (num_pivots > num_points).any():
                 raise InputError(
-                    f"a line of class {label} has {int(numbers.max())} pivots, but the head "
+                    f"a line of class {label} has {int(num_pivots.max())} pivots, but the head "
                     f"has {num_points} points: set num_points of FormatPivotTargets to the points "
                     "in the head's queries."
                 )
             class_truth = TrueLines(
                 pivots=pivots[is_class, :num_points],
-                numbers=numbers,
+                numbers=num_pivots,
                 masks=instances.masks[is_class].float(),
             )
             truths.append(class_truth)
@@ -193,5 +198,8 @@ class PivotHead(LineHead):
 
         Returns:
             Weighted scalar.
+
+        Raises:
+            ValueError: If there are more levels than ``level_weights``.
         """
         return super().semantic_loss(levels, truths) / len(self.classes)

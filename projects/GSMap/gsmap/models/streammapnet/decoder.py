@@ -74,7 +74,7 @@ class StreamMapNetDecoder(MapDecoder):
         kwargs: Further arguments of `MapDecoder`.
     """
 
-    point_queries = False
+    point_queries = False  # the queries are of instances (B, N, C), not of points (B, N * P, C)
     layer_class = StreamMapNetDecoderLayer
 
     def __init__(
@@ -86,6 +86,7 @@ class StreamMapNetDecoder(MapDecoder):
     ) -> None:
         super().__init__(layer or {}, embed_dims=embed_dims, **kwargs)
         self.input_proj = nn.Conv2d(bev_dims or embed_dims, embed_dims, kernel_size=1)
+        # Half of the channels encode the row of a cell, the other half its column.
         self.code = SinePositionalEncoding(embed_dims // 2, normalize=True)
 
     def start(
@@ -95,13 +96,15 @@ class StreamMapNetDecoder(MapDecoder):
 
         Args:
             query: Instance queries. (B, N, C)
-            reference: Initial lines. (B, N, P * D)
+            reference: Initial lines: the references of all points of a query, D values for each.
+                (B, N, P * D)
             bev_feats: BEV features. (B, C', H, W)
 
         Returns:
             Instance queries (B, N, C), references of their points (B, N * P, D), and projected BEV
             features with the sine encoding (B, C, H, W).
         """
+        # The encoding takes a mask of the cells to leave out: none.
         cells = bev_feats.new_zeros((1, *bev_feats.shape[-2:]), dtype=torch.bool)
         # The first row of StreamMapNet's encoding is at the largest y, but the first row of the BEV
         # features is at the smallest y.
@@ -110,7 +113,10 @@ class StreamMapNetDecoder(MapDecoder):
         return query, points, self.input_proj(bev_feats) + code
 
     def point_states(self, state: Tensor) -> Tensor:
-        """Return the states from which the lines are refined, one per instance. (B, N, C)"""
+        """Return the states from which the lines are refined, one per instance. (B, N, C)
+
+        The state of an instance refines all its points at once.
+        """
         return state
 
     def read(self, state: Tensor, references: Tensor) -> Decoded:

@@ -165,6 +165,8 @@ class KeyPointHead(DetectionHead):
         self.grid = grid
         self.classes = tuple(classes)
         self.reference: KeyPointReference = KeyPointReference(Canvas(grid, **(canvas or {})))
+        # The coder selects the detections with the highest scores, by default 35. Without a margin,
+        # it also keeps detections outside of the map.
         coder_settings: PartConfig = {"max_num": 35, "margin_m": None, **(coder or {})}
         self.coder = MapCoder(grid, **coder_settings)
         if self.coder.unfold_classes:
@@ -179,9 +181,11 @@ class KeyPointHead(DetectionHead):
         num_layers = layer_settings.pop("num_layers")
         check_positive(num_layers=num_layers)
         self.context = BEVEmbedding(in_channels, embed_dims)
+        # Embeddings have 2 C channels: the position of a query, then its content. The embedding of
+        # a key point is the sum of an element's and a corner's.
         self.elements = nn.Embedding(num_queries, 2 * embed_dims)
         self.corners = nn.Embedding(_CORNERS, 2 * embed_dims)
-        self.initial = nn.Linear(embed_dims, 2)
+        self.initial = nn.Linear(embed_dims, 2)  # from the position to the logits of a corner
         self.layers = nn.ModuleList(
             KeyPointLayer(embed_dims, **layer_settings) for _ in range(num_layers)
         )
@@ -204,7 +208,7 @@ class KeyPointHead(DetectionHead):
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings of `FormatPolylineTargets` that follow from the head's settings."""
-        return dict(settings["canvas"] or {})
+        return dict(settings["canvas"] or {})  # the transform has the settings of `Canvas`
 
     def forward(self, bev_outputs: Tensors) -> list[KeyPointPredictions]:
         """Predict elements from ``bev_feats`` (B, C', H, W), once per decoder layer."""
@@ -213,7 +217,7 @@ class KeyPointHead(DetectionHead):
         embeddings = embeddings.flatten(0, 1).expand(len(context), -1, -1)  # (B, N * 2, 2 C)
         pos, states = embeddings.chunk(2, dim=-1)
         start = self.initial(pos).float()
-        reference = start.sigmoid()
+        reference = start.sigmoid()  # all layers attend to the map around the initial corners
         outputs = []
         for layer in self.layers:
             states = layer(states, pos, reference=reference, context=context)
@@ -251,6 +255,7 @@ class KeyPointHead(DetectionHead):
         tokens = [str(sample.metainfo.get("token")) for sample in batch_data_samples]
         cls_terms = []
         box_terms = []
+        # Matching and losses are computed in float32.
         with torch.autocast(bev_outputs["bev_feats"].device.type, enabled=False):
             for output in outputs:
                 loss_cls, loss_box = self.layer_losses(output, truths, tokens=tokens)
@@ -265,14 +270,16 @@ class KeyPointHead(DetectionHead):
 
         Args:
             output: Predictions of the layer.
-            truths: Targets of each sample. (B,)
+            truths: Targets of each sample: ``labels_3d`` (K,), and ``keypoints`` (K, 4), the
+                corners x0, y0, x1, y1 in pixels of the canvas. (B,)
             tokens: Name (``token``) of each sample, for error messages. (B,)
 
         Returns:
-            Both losses as weighted scalars, averaged over the matched elements of the batch.
+            Both losses as weighted scalars, averaged over the matched elements of the batch. The
+            corner loss is also averaged over the coordinates of an element.
         """
         scores = output.scores.float()
-        boxes = output.references.float().flatten(2)
+        boxes = output.references.float().flatten(2)  # (B, N, 4)
         # In mmdet's focal loss, the number of classes is the label of the background.
         labels = torch.full_like(scores[..., 0], len(self.classes), dtype=torch.long)
         num_matches = 0
@@ -309,7 +316,7 @@ class KeyPointHead(DetectionHead):
         Raises:
             FloatingPointError: If a matching cost is not finite.
         """
-        costs = self.costs(scores, boxes, truth=truth).cpu()
+        costs = self.costs(scores, boxes, truth=truth).cpu()  # the assignment is solved on the CPU
         names = ["class scores", "corners", "overlaps"]
         rows, cols = solve_assignment(costs, names, img_meta={"token": token})
         return rows.to(boxes.device), cols.to(boxes.device)
@@ -328,7 +335,7 @@ class KeyPointHead(DetectionHead):
         pred_instances = InstanceData(scores=scores)
         gt_instances = InstanceData(labels=truth.labels_3d)
         distance = torch.cdist(boxes, truth.keypoints, p=1)
-        overlap = bbox_overlaps(boxes, truth.keypoints, mode="giou")
+        overlap = bbox_overlaps(boxes, truth.keypoints, mode="giou")  # a larger overlap costs less
         cls_cost = self.cost_cls(pred_instances, gt_instances)
         return torch.stack([cls_cost, self.box_weight * distance, -self.giou_weight * overlap])
 
@@ -349,6 +356,7 @@ def get_targets(sample: Det3DDataSample, canvas: Canvas) -> InstanceData:
             f"sample {sample.metainfo.get('token')!r} has no key points: add FormatPolylineTargets "
             "to the training pipeline."
         )
+    # The transform has stored the settings of its canvas: pixel, margin and ranges.
     target_settings = tuple(instances.metainfo["canvas"])
     if target_settings != canvas.settings:
         raise InputError(

@@ -1,4 +1,8 @@
-"""VectorMapNet's polyline generator, which predicts the points of an element token by token."""
+"""VectorMapNet's polyline generator, which predicts the points of an element token by token.
+
+A token is an integer: the x or y of a point in pixels of the canvas plus one, or 0, the stop token.
+The tokens of a line are x, y, x, y, ... and a stop token.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -31,7 +35,7 @@ class PolylineGenerator(BaseModule):
     """Autoregressive generator of polylines with any number of points within boxes.
 
     Args:
-        canvas: Raster of the tokens.
+        canvas: Raster of W x H pixels over the map and a margin, whose pixels are the tokens.
         num_classes: Number of classes.
         in_channels: Channels C' of the BEV features.
         embed_dims: Channels C of the tokens.
@@ -54,7 +58,8 @@ class PolylineGenerator(BaseModule):
         init_cfg: Initialisation config of mmengine.
 
     Raises:
-        ValueError: If a share is not in [0, 1], or if ``max_points`` is out of range.
+        ValueError: If ``top_p`` or ``noise_share`` is not in [0, 1], ``max_points`` is out of
+            range, or ``num_layers`` is not positive.
     """
 
     def __init__(
@@ -98,6 +103,8 @@ class PolylineGenerator(BaseModule):
             self.metres_from_norm = canvas.grid.metres_from_norm
         check_positive(num_layers=num_layers)
         self.context = BEVEmbedding(in_channels, embed_dims)
+        # The embedding of a coordinate is the sum of three vectors: for its token, for its axis (x
+        # or y), and for the number of its point or box corner.
         self.label = nn.Embedding(num_classes, embed_dims)
         self.vertex = nn.Embedding(canvas.num_tokens, embed_dims)
         self.position = nn.Embedding(num_positions, embed_dims)
@@ -112,7 +119,7 @@ class PolylineGenerator(BaseModule):
     def init_weights(self) -> None:
         """Initialise matrices with Xavier's method."""
         super().init_weights()
-        for module in (self.layers, self.context, self.logits):
+        for module in (self.layers, self.context, self.logits):  # others keep torch's default
             init_matrices(module)
 
     def memory(self, bev_feats: Tensor) -> list[Cache]:
@@ -202,7 +209,8 @@ class PolylineGenerator(BaseModule):
             Log-probabilities. (n, T + 1, tokens)
         """
         states = self.states(bev_feats, elements, tokens=tokens)[-1]
-        first = _CONDITION - 1  # the last condition token predicts the first token of the line
+        # A state predicts the next token, so the last condition token predicts the first token.
+        first = _CONDITION - 1
         logits = self.logits(states[:, first:]).float()
         return self.mask_forbidden(logits).log_softmax(dim=-1)
 
@@ -214,7 +222,7 @@ class PolylineGenerator(BaseModule):
         Args:
             bev_feats: BEV features of the sample. (C', H, W)
             elements: Annotated classes and boxes.
-            tokens: Annotated tokens with a stop token, filled with zeros. (n, T)
+            tokens: Annotated tokens with a stop token, filled up with zeros. (n, T)
             weights: Weights of the tokens, 0 after the stop token. (n, T)
 
         Returns:
@@ -232,7 +240,7 @@ class PolylineGenerator(BaseModule):
         if not len(tokens):  # a loss of 0 that gives every parameter a gradient of 0
             sums = [parameter.sum() for parameter in self.parameters()]
             return torch.stack(sums).sum() * 0
-        inputs = tokens[:, :-1]
+        inputs = tokens[:, :-1]  # no token follows the last one
         boxes = elements.boxes
         if self.training and self.noise_share:
             inputs = self.add_noise(inputs).where(inputs > 0, 0)  # stop tokens and filling stay 0
@@ -270,9 +278,10 @@ class PolylineGenerator(BaseModule):
         """
         number = torch.arange(tokens.shape[1], device=tokens.device)
         axis = number % 2
-        source = number - axis if by_x else number  # number - axis: the x of each point
+        # Index of the coordinate that is shifted; number - axis is the x of each point.
+        shifted_index = number - axis if by_x else number
         largest = constant(tokens, self.canvas.size)[axis]
-        shifted_tokens = (tokens + noise)[:, source].clamp(min=1)
+        shifted_tokens = (tokens + noise)[:, shifted_index].clamp(min=1)
         return shifted_tokens.minimum(largest)
 
     @torch.no_grad()
@@ -285,11 +294,12 @@ class PolylineGenerator(BaseModule):
             draw: Function that samples tokens (n, t) from probabilities (n, t, tokens).
 
         Returns:
-            Tokens, 0 from the end of a line on. (n, 2 * max_points + 1)
+            Tokens, 0 from the end of a line on. A line that is not finished after ``max_points``
+            points is cut off. (n, 2 * max_points + 1)
         """
         memory = self.memory(bev_feats)
         condition = self.embed_condition(elements)
-        num_steps = 2 * self.max_points + 1
+        num_steps = 2 * self.max_points + 1  # x and y of each point, and the stop token
         tokens = elements.labels.new_zeros(len(condition), num_steps)
         if not len(tokens):
             return tokens
@@ -301,10 +311,12 @@ class PolylineGenerator(BaseModule):
         states = condition
         for step in range(num_steps):
             for i, layer in enumerate(self.layers):
+                # Keys and values of all tokens so far; the new tokens attend to them.
                 cache = append_cache(caches[i], layer.keys_values(states))
                 caches[i] = cache
                 states = layer(states, cache, memory=memory[i])
             logits = self.mask_forbidden(self.logits(states[:, -1:]).float(), start=step)
+            # `keep_most_likely` masks the tokens that `top_p` excludes.
             probs = keep_most_likely(logits, self.top_p).softmax(dim=-1)  # (n, 1, tokens)
             all_probs = torch.cat([all_probs, probs], dim=1) if self.redraw else probs
             samples = draw(all_probs)
@@ -313,6 +325,7 @@ class PolylineGenerator(BaseModule):
             is_active = new_tokens > 0  # an entry for each row in `active`
             if not is_active.any() or step == num_steps - 1:
                 break
+            # Drop the lines that have ended from all tensors.
             active = active[is_active]
             all_probs = all_probs[is_active]
             samples = samples[is_active]
@@ -344,8 +357,8 @@ class PolylineGenerator(BaseModule):
             tokens: Tokens, from `generate`. (n, 2 P + 1)
 
         Returns:
-            Points in metres, with the last point of each line repeated to the end of the row
-            (n, P, 2), and the number of points of each line. (n,)
+            Points in metres (n, P, 2), with the last point of each line repeated to the end of the
+            row, and the number of points of each line (n,).
         """
         pairs = tokens[:, :-1].unflatten(1, (-1, 2))  # (n, P, 2)
         num_points = (pairs > 0).all(dim=-1).sum(dim=-1)  # (n,)
@@ -353,6 +366,7 @@ class PolylineGenerator(BaseModule):
         index = torch.arange(pairs.shape[1], device=tokens.device).minimum(last)  # (n, P)
         filled_pairs = pairs.gather(1, index[..., None].expand(-1, -1, 2))
         pixels = filled_pairs - 1  # token 1 is pixel 0
+        # Number of the last pixel along x and y, at which normalised coordinates are 1.
         steps = constant(pairs, self.canvas.steps, torch.float)
         return self.metres_from_norm(pixels / steps), num_points
 

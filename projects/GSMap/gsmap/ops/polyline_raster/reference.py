@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-BLOCK_VALUES = 1 << 22  # number of distances in memory at a time
+BLOCK_VALUES = 1 << 22  # number of distances of pixels from edges in memory at a time
 GPU_BLOCK_VALUES = 1 << 25  # on a GPU; with fewer, launches take longer than the arithmetic
 DISTANCE_EPS = 1e-6  # smallest distance of a pixel from an edge, in pixels
 # Added to the squared length of an edge, which may be a point, as in Zhang et al.'s released code.
@@ -50,22 +50,24 @@ def _segment_distance(pixels: Tensor, start: Tensor, end: Tensor, eps: float) ->
     """Squared distances of points from segments. (..., 2) each -> (...)"""
     edge = end - start
     offsets = pixels - start
-    length2 = (edge.square().sum(-1) + eps).clamp(min=1e-38)  # no division by 0 for a point
+    # The clamp avoids a division by 0 for a segment that is a point. 1e-38 is about the smallest
+    # normal number of float32.
+    length2 = (edge.square().sum(-1) + eps).clamp(min=1e-38)
     along = ((offsets * edge).sum(-1) / length2).clamp(0, 1)
     return (offsets - along[..., None] * edge).square().sum(-1)
 
 
 def _inside_polygon(pixels: Tensor, vertices: Tensor) -> Tensor:
-    """Mask of the pixels inside by the even-odd rule. (H, W, 2), (K, V, 2) -> (K, H, W)"""
+    """Mask of the pixels inside of polygons. (H, W, 2), (K, V, 2) -> (K, H, W)"""
     shape = (len(vertices), *pixels.shape[:2])
     crossings = torch.zeros(shape, dtype=torch.long, device=vertices.device)
     x, y = pixels.unbind(-1)
-    # Count the edges that the ray from a pixel towards larger x crosses: a pixel is inside if their
-    # number is odd.
+    # Even-odd rule: count the edges that the ray from a pixel towards larger x crosses. A pixel is
+    # inside if their number is odd.
     for _, start, end in _edge_blocks(shape, vertices, ends=vertices.roll(-1, 1)):
         x0, y0 = start.unbind(-1)
         x1, y1 = end.unbind(-1)
-        straddles = (y0 > y) != (y1 > y)
+        straddles = (y0 > y) != (y1 > y)  # one end is above the row of the pixel, the other is not
         rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)  # no division by 0
         crossing_x = (x1 - x0) * (y - y0) / rise + x0
         crossings += (straddles & (x < crossing_x)).sum(1)
@@ -82,7 +84,8 @@ def soft_rasters_reference(
 ) -> Tensor:
     r"""Render closed rings: lines as :math:`\exp(-D / s)`, polygons as :math:`\sigma(\pm D / s)`.
 
-    D is the squared distance of a pixel to the nearest edge. The sign is + inside of the polygon.
+    D is the squared distance of a pixel to the nearest edge, and s is the softness. The sign is +
+    inside of the polygon. Both kinds of rings have an edge from the last vertex to the first.
 
     Args:
         rings: Vertices in pixels; pixel (row, col) is sampled at (col, row). (n, V, 2)
@@ -101,6 +104,7 @@ def soft_rasters_reference(
     distances = _edge_distances(pixels, rings, ends=rings.roll(-1, 1), eps=LENGTH_EPS)
     if plain:  # the clamp has no gradient on an edge, where the distance has a kink
         distances = distances.clamp(min=DISTANCE_EPS**2).sqrt()
+    # Inside or outside has no gradient, so it is computed from detached vertices.
     signed = torch.where(_inside_polygon(pixels, rings.detach()), distances, -distances)
     lines = torch.exp(-distances / softness[0])
     polygons = torch.sigmoid(signed / softness[1])
@@ -122,6 +126,7 @@ def draw_reference(
     Returns:
         Masks in [0, 1]. (K, H, W)
     """
+    # The edge from the last to the first vertex is drawn for polygons only.
     to_line = _edge_distances(pixels, polylines[:, :-1], ends=polylines[:, 1:]).sqrt()
     to_closing = _edge_distances(pixels, polylines[:, -1:], ends=polylines[:, :1]).sqrt()
     inside = _inside_polygon(pixels, polylines)

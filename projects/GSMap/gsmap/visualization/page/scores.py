@@ -24,6 +24,7 @@ from gsmap.utils.split_lists import require_results_of
 
 MATCH_M = 1.0
 """Largest Chamfer distance in metres of a hit on the page."""
+# Column of this distance in `FrameMatches.matched_gt`, which has one column for each threshold.
 _HIT_COLUMN = CHAMFER_THRESHOLDS.index(MATCH_M)
 
 
@@ -34,7 +35,7 @@ class ScoredResult:
     Args:
         name: Name of the result on the page.
         predictions: Elements of each sample, by token.
-        matches: Matches of each sample by Chamfer distance, by token.
+        matches: Matches of each sample by token; matches are pairs with a small Chamfer distance.
         reports: Report of each metric.
         notes: Remarks on the samples for the reader.
         law: Distribution of the errors of vertices with Gaussians, ``normal`` or ``laplace``.
@@ -70,7 +71,7 @@ class ScoredResult:
         if total == 0:
             return 1.0
         num_hits = int((self.hits(token)[is_counted] >= 0).sum())
-        return 2 * num_hits / total
+        return 2 * num_hits / total  # total: predictions and ground truths together
 
 
 def score_result(
@@ -107,12 +108,14 @@ def score_result(
     """
     file = SampleFile(path, RESULTS_KEY, meta.classes, gaussians=True)
     predictions = {}
+    # After the last sample, `file` has the metadata (`about`) and the numbers of ignored elements.
     for token, elements, _ in file:
         predictions[token] = elements
     if not allow_other_split:
         # Refuse results for other data, or of a model that was trained on another list of scenes.
         require_results_of(meta.split_list, about=file.about, path=path)
     try:
+        # Notes on samples without results and on results without ground truth.
         notes = mismatch_notes(predictions, truth, allowed=allow_mismatch)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
@@ -126,20 +129,20 @@ def score_result(
         notes.append(f"{count} predictions of class {class_name!r} are not scored")
     evaluator = _create_evaluator(meta)
     no_elements = MapElements.from_polylines()
-    sample_values = []
+    samples = []
     matches = {}
     for token, true_elements in truth.items():
-        values = evaluator.match(
+        # Matches of the sample under each metric, by the name of the metric.
+        matches_of_metrics = evaluator.match(
             token, predictions=predictions.get(token, no_elements), ground_truth=true_elements
         )
-        chamfer = cast(FrameMatches, values["chamfer"])
-        sample_values.append(values)
-        matches[token] = chamfer
+        samples.append(matches_of_metrics)
+        matches[token] = cast(FrameMatches, matches_of_metrics["chamfer"])
     return ScoredResult(
         name,
         predictions=predictions,
         matches=matches,
-        reports=evaluator.reports(sample_values),
+        reports=evaluator.reports(samples),
         notes=notes,
         law=law or law_of(file.about),
     )
@@ -166,8 +169,9 @@ def score_by_distance(
         sample = Sample(token, predictions=predictions, ground_truth=true_elements)
         samples.append(sample)
     area_labels = [label for label, name in enumerate(meta.classes) if name in AREA_CLASSES]
-    pieces = cut_by_distance(samples, areas=area_labels)
-    return replace(result, reports=evaluator.reports(evaluator.match_all(pieces)))
+    # One new sample for each band of a sample, with the parts of the elements in the band.
+    bands = cut_by_distance(samples, areas=area_labels)
+    return replace(result, reports=evaluator.reports(evaluator.match_all(bands)))
 
 
 def _create_evaluator(meta: AnnotationMeta) -> MapEvaluator:
