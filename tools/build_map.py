@@ -43,7 +43,7 @@ from drivemaps.truth import true_map
 from drivemaps.video import write_video
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile
+from gsmap.evaluation.core.results_json import RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
@@ -607,12 +607,19 @@ def group_scenes(
 def read_results(args: argparse.Namespace, ann: AnnotationFile) -> dict[str, MapElements]:
     """Read the predictions in the annotation frames of the samples, by token.
 
+    Predictions of classes that the annotation file lacks are left out and printed.
+
     Raises:
         ValueError: If the file is malformed, or if maps are scored and the model was trained on
             another split.
     """
     file = SampleFile(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
-    results = {token: elements for token, elements, _ in file}
+    results = {}
+    for token, elements, _ in file:
+        results[token] = elements.select(elements.labels >= 0)  # -1: a class that is not in `ann`
+    for name, number in sorted(file.ignored.items()):
+        if name != THREE_D:
+            print(f"not used: {format_count(number, 'prediction')} of class {name!r}")
     if has_truth(ann) and not args.allow_other_split:  # maps are scored
         require_results_of(ann.meta.split_list, file.about, args.results)
     return results

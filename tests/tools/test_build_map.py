@@ -56,6 +56,22 @@ def test_ground_truth_as_predictions_scores_1(files, tmp_path, capsys):
     assert orange.mean() > 1e-3  # the dividers, in the colour of all pictures
 
 
+def test_predictions_of_other_classes_are_left_out_and_counted(files, tmp_path, capsys):
+    results, ann = files
+    content = json.loads(results.read_text())
+    for sample in content["results"]:
+        sample["vectors"].append({**sample["vectors"][0], "cls_name": "kerb"})
+    (tmp_path / "more.json").write_text(json.dumps(content))
+    for name, given in (("plain", results), ("more", tmp_path / "more.json")):
+        main([str(given), "--ann", str(ann), "--out", str(tmp_path / name)])
+        note = f"not used: {len(content['results'])} predictions of class 'kerb'"
+        assert (note in capsys.readouterr().out) == (name == "more")
+    for name in ("scores.json", "scene.geojson"):
+        assert (tmp_path / "plain" / name).read_bytes() == (tmp_path / "more" / name).read_bytes()
+    prior = ["--prior", str(tmp_path / "street.gsmap-prior"), "--gaussians"]
+    main([str(tmp_path / "more.json"), "--ann", str(ann), *prior])
+
+
 def test_drives_of_a_place_are_joined_into_one_map(files, tmp_path, capsys):
     results, ann = files
     file = AnnotationFile(ann)
