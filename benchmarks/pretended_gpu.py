@@ -41,9 +41,9 @@ from benchmarks.pretended_operators import (
 from gsmap.ops import backends
 from gsmap.utils.shipped import shipped_path
 
-NAME = "pretended"
+NAME = "pretended"  # device type, in place of "cuda"
 DEVICE = f"{NAME}:0"
-ROOT = shipped_path()
+ROOT = shipped_path()  # root folder of the repository
 aten = torch.ops.aten
 
 # Largest number of tensors per list in one launch of a `torch._foreach_*` kernel, for kernels that
@@ -58,10 +58,12 @@ def available() -> bool:
 
 def _register() -> None:
     """Register the device with torch, once per process."""
+    # PrivateUse1 is torch's place for one additional device type.
     if torch._C._get_privateuse1_backend_name() == NAME:
         return
 
     class Backend(registration._DummyBackendModule):  # type: ignore[name-defined]
+        # `torch.autocast` calls this method of a backend.
         def get_amp_supported_dtype(self) -> list[torch.dtype]:
             return [torch.float16, torch.bfloat16]
 
@@ -80,6 +82,7 @@ class PretendedTensor(Tensor):
     @staticmethod
     def __new__(cls, data: Tensor) -> "PretendedTensor":
         """Wrap values on the CPU."""
+        # torch takes the wrapper for a tensor on the device. It has no memory apart from `host`.
         tensor: Any = torch.Tensor._make_wrapper_subclass(
             cls,
             data.size(),
@@ -123,10 +126,13 @@ class PretendedTensor(Tensor):
     def __torch_dispatch__(  # type: ignore[override]  # torch declares an attribute
         cls, func: Any, types: Any, args: Any = (), kwargs: dict | None = None
     ) -> Any:
+        # An active `PretendedGPU` handles operations before this method is called. torch calls this
+        # method for operations outside of the context, and while the context handles another one.
         if PretendedGPU.current is None:
             raise RuntimeError(f"{func} of a tensor on {DEVICE} outside of PretendedGPU.")
         return PretendedGPU.current.run(func, args, kwargs or {})
 
+    # Python functions of torch run as usual: only the operations that they call are intercepted.
     __torch_function__: Any = torch._C._disabled_torch_function_impl
 
 
@@ -134,6 +140,7 @@ class PretendedGPU(TorchDispatchMode):
     """Context in which the device can be used, with counts of its work.
 
     Attributes:
+        current: The context that is active; None outside of a context.
         launches: Number of kernels and copies, by part and operation. A part is a section of the
             work that the caller names with `part`.
         waits: Number of waits of the host, by part, reason and line of code.
@@ -153,6 +160,8 @@ class PretendedGPU(TorchDispatchMode):
 
     def __enter__(self) -> "PretendedGPU":
         _register()
+        # The project reads two tables by the name of a backend, ``cpu`` or ``triton``: the device
+        # type of its tensors, and whether its package is installed.
         devices = {**backends.DEVICES, "triton": NAME}
         installed = {**backends.INSTALLED, "triton": True}
         foreach_types = [*foreach_utils._foreach_supported_types, PretendedTensor]
@@ -163,6 +172,7 @@ class PretendedGPU(TorchDispatchMode):
             _flag(torch.__future__.set_overwrite_module_params_on_conversion),
             # `torch.tensor(.., device)` makes a tensor on the CPU and then uploads it.
             _flag(torch._C._set_only_lift_cpu_tensors),
+            # Without a replacement, attention would be several operations on this device.
             _replace_attribute(F, "scaled_dot_product_attention", _attention),
             # The project chooses its Triton kernels for tensors on this device.
             _replace_attribute(backends, "DEVICES", devices),
@@ -200,28 +210,29 @@ class PretendedGPU(TorchDispatchMode):
         Args:
             name: Name of the part.
         """
-        before = self._part
+        outer_part = self._part
         self._begin(name)
         try:
             yield
         finally:
-            self._begin(before)
+            self._begin(outer_part)
 
     def _begin(self, part: str) -> None:
         """Count the work from here on, and later its gradients, for a part."""
         self._part = part
+        # The sequence number is the number that autograd gives to its next node.
         self._marks.append((torch._C._autograd._get_sequence_nr(), part))
 
     @contextlib.contextmanager
     def backward(self) -> Iterator[None]:
         """Count each launch inside the context for the part whose gradient it computes."""
-        before = self._part
+        outer_part = self._part
         self._in_backward = True
         try:
             yield
         finally:
             self._in_backward = False
-            self._part = before
+            self._part = outer_part
 
     def run(self, func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         """Compute an operation on the CPU and count it.
@@ -237,6 +248,7 @@ class PretendedGPU(TorchDispatchMode):
         tensors = [*_tensors_in(args), *_tensors_in(kwargs.values())]
         on_gpu = any(isinstance(tensor, PretendedTensor) for tensor in tensors)
         target = kwargs.get("device")
+        # A function such as `torch.zeros` creates its result on the device that it is given.
         to_gpu = target is not None and torch.device(target).type == NAME
         if not on_gpu and not to_gpu:
             return func(*args, **kwargs)
@@ -276,7 +288,7 @@ class PretendedGPU(TorchDispatchMode):
         Returns:
             Result of the operation, with its tensors on the device.
         """
-        # Pinned memory needs a real GPU.
+        # Pinned memory needs a real GPU, and the CPU does not need it.
         kwargs = {key: value for key, value in kwargs.items() if key != "pin_memory"}
         if "device" in kwargs:
             kwargs["device"] = torch.device("cpu")
@@ -289,15 +301,20 @@ class PretendedGPU(TorchDispatchMode):
             function = REPLACEMENTS.get(func, func)
             result = function(*host_args, **host_kwargs)
         if func in READS:
-            return result  # a number of Python
+            return result  # a number or bool of Python, not a tensor
         result = _to_gpu(result)
         if not on_gpu or is_project_kernel or func in REPLACEMENTS:
-            return result
+            return result  # new tensors, which share no memory with an argument
         # A view shares the storage of its argument, and an operation in place returns its argument.
         return return_and_correct_aliasing(func, args, kwargs=kwargs, out=result)
 
     def _convert(self, source: Tensor, kwargs: dict[str, Any]) -> Tensor:
-        """Copy a tensor to another type or device, with the arguments of ``aten._to_copy``."""
+        """Copy a tensor to another type or device.
+
+        Args:
+            source: Tensor on the CPU or on the device.
+            kwargs: Arguments of ``aten._to_copy`` by name, such as ``device`` and ``dtype``.
+        """
         target = kwargs.get("device")
         device_type = torch.device(target).type if target is not None else source.device.type
         is_blocking = not kwargs.get("non_blocking")
@@ -342,7 +359,8 @@ class PretendedGPU(TorchDispatchMode):
         Args:
             func: Operation of torch.
             name: Name of the operation.
-            args: Positional arguments.
+            args: Positional arguments. For an operation in ``INDEXING``, the first one is the
+                indexed tensor, and the second one lists an index, or None, for each axis.
             tensors: All tensors among the arguments.
 
         Raises:
@@ -365,6 +383,7 @@ class PretendedGPU(TorchDispatchMode):
             if not isinstance(index, PretendedTensor):
                 self._wait("upload of an index")
                 self._launch("upload")
+        # A mask selects a number of elements that depends on its values.
         if any(index.dtype in (torch.bool, torch.uint8) for index in indices):
             self._wait("boolean index")
 
@@ -372,7 +391,8 @@ class PretendedGPU(TorchDispatchMode):
         """Part whose gradient autograd is computing.
 
         Sums of gradients belong to no node of the forward pass. They are counted for
-        ``backward: sums``.
+        ``backward: sums``. Gradients of work outside of all parts are counted for
+        ``backward: rest``.
         """
         node = torch._C._current_autograd_node()
         if node is None or "AccumulateGrad" in node.name():
@@ -421,7 +441,7 @@ def _to_gpu(result: Any) -> Any:
 
 
 def _line_of_project() -> str:
-    """Innermost line outside of torch and of this file, as ``file:line``."""
+    """Innermost line of the project or of OpenMMLab on the stack, as ``file:line``; else ``?``."""
     frame: FrameType | None = sys._getframe(2)  # caller of `_wait`
     while frame is not None:
         name = _short_name(frame.f_code.co_filename)
@@ -433,11 +453,15 @@ def _line_of_project() -> str:
 
 @cache
 def _short_name(file: str) -> str | None:
-    """Short name of a file of the project or of OpenMMLab; None for torch and for this file."""
+    """Short name of a file of the project or of OpenMMLab; None for this and for other files.
+
+    The name is relative to the repository, or to ``site-packages`` for OpenMMLab.
+    """
     path = Path(file)
     if path.is_relative_to(ROOT) and "site-packages" not in path.parts:
         return str(path.relative_to(ROOT)) if path != Path(__file__) else None
-    if any(part.startswith("mm") for part in path.parts):
+    # The packages of OpenMMLab are mmcv, mmdet, mmdet3d and mmengine.
+    if any(folder.startswith("mm") for folder in path.parts):
         packages = path.parts[path.parts.index("site-packages") + 1 :]
         return "/".join(packages)
     return None
@@ -473,14 +497,15 @@ def _flag(set_flag: Callable[[bool], None]) -> Iterator[None]:
 @contextlib.contextmanager
 def _replace_attribute(owner: Any, name: str, value: Any) -> Iterator[None]:
     """Replace an attribute inside the context."""
-    before = getattr(owner, name)
+    original = getattr(owner, name)
     setattr(owner, name, value)
     try:
         yield
     finally:
-        setattr(owner, name, before)
+        setattr(owner, name, original)
 
 
+# torch's function, which `_attention` replaces inside of `PretendedGPU`.
 _plain_attention = F.scaled_dot_product_attention
 
 
@@ -518,6 +543,8 @@ def _attention(
             bias = zeros.masked_fill_(bias.logical_not(), float("-inf"))
         batch, heads, num_queries, _ = query.shape
         bias = bias.expand(batch, heads, num_queries, key.shape[2])
+    # The kernel computes the log-sums of the softmax only if backward will read them. They are
+    # among its further results, which are not used here.
     needs_gradient = torch.is_grad_enabled()
     return aten._scaled_dot_product_efficient_attention(
         query, key, value, bias, needs_gradient, dropout_p, is_causal

@@ -66,7 +66,8 @@ def find_changes(
 
     Args:
         old: Old map in the global frame.
-        passes: Drives past the place, each with its map. All maps must have equal classes.
+        passes: Drives past the place, one or more, each with its map. All maps must have equal
+            classes.
         config: Parameters of merging; ``MergeConfig()`` by default.
 
     Returns:
@@ -78,39 +79,46 @@ def find_changes(
     config = config or MergeConfig()
     passes = list(passes)
     classes = passes[0].drive.classes
+    # Changes are searched only near the drives. The whole map is needed to count the elements that
+    # no pass has in view.
     whole_map = old
     old = _near_passes(old, passes)
     changes: list[Change] = []
     for label, name in enumerate(classes):
         find_in_class = area_changes if name in AREA_CLASSES else line_changes
+        # Candidates: `num_passes` of the `passes_in_view` passes agree with the change.
         for change in find_in_class(old, passes, label, config):
             if change.num_passes >= _MIN_SHARE * change.passes_in_view:
                 changes.append(change)
+    # By class, then by kind (removed, added, moved), then the most certain change first.
     changes.sort(key=lambda change: (change.label, KINDS.index(change.kind), -change.confidence))
     num_on_new_ground: Counter[str] = Counter()
     for one_pass in passes:
-        for line, label, _ in one_pass.elements.rows:
+        for line, label, _ in one_pass.elements.rows:  # vertices, class index and score
+            # Known ground is within 30 m of an element of the old map.
             if not on_known_ground(line, old).any():
                 num_on_new_ground[classes[label]] += 1
     num_not_in_view: Counter[str] = Counter()
-    # Number of frames that have a vertex in range, in the pass with the most such frames. (M,)
+    # For each of the M vertices of the map: the number of frames that have it in range, in the pass
+    # with the most such frames. (M,)
     most_views = views_of_passes(whole_map.points[:, :2], passes).max(axis=0)
     for index, label in enumerate(whole_map.labels.tolist()):
         vertices = slice(whole_map.offsets[index], whole_map.offsets[index + 1])
+        # A point is in view from MIN_VIEWS frames on. An element without vertices has 0 views.
         if most_views[vertices].max(initial=0) < MIN_VIEWS:
             num_not_in_view[classes[label]] += 1
     return Changes(changes, dict(num_on_new_ground), num_not_in_view=dict(num_not_in_view))
 
 
 def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
-    """Select the elements of an old map near the drives.
+    """Select the elements of an old map whose bounding boxes are near the drives.
 
     Raises:
         ValueError: If the total length of their lines is too large. The lines are later sampled
-            every metre.
+            every metre, so time and memory grow with the length.
     """
     origins = []
-    reach_m = 0.0
+    reach_m = 0.0  # largest distance from the vehicle to a point of the range of a frame
     for one_pass in passes:
         origins += [frame.origin for frame in one_pass.drive.frames]
         reach_m = max(reach_m, one_pass.drive.reach_m)
@@ -125,8 +133,8 @@ def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
         points = line[:, :2]
         # The bounding box of the line overlaps the box of the drives if both are true.
         starts_before = bool((points.min(axis=0) <= high).all())
-        ends_behind = bool((points.max(axis=0) >= low).all())
-        if starts_before and ends_behind:
+        ends_after = bool((points.max(axis=0) >= low).all())
+        if starts_before and ends_after:
             is_near[index] = True
             total_m += float(arc_lengths(points)[-1])
     if total_m > MAX_TOTAL_LENGTH_M:
@@ -157,7 +165,8 @@ def write_changes(
         changes: Changes in the global frame.
         classes: Class names in label order.
         place: Name of the map, the value of the property ``map``.
-        origin: Position of the global frame on the Earth; without one, coordinates are metres.
+        origin: Position of the global frame on the Earth, for coordinates in degrees. Without an
+            origin, coordinates are metres in the global frame.
 
     Raises:
         RuntimeError: If an origin is given and ``pyproj`` is missing.
@@ -187,7 +196,8 @@ def summarize_changes(found: Changes) -> str:
         found: Changes of a place.
 
     Returns:
-        One line, such as ``2 removed, 0 added, 1 moved (not compared: 3 on new ground)``.
+        One line, such as
+        ``2 removed, 0 added, 1 moved (not compared: 3 divider on new ground)``.
     """
     counts = Counter(change.kind for change in found.changes)
     text = ", ".join(f"{counts[kind]} {kind}" for kind in KINDS)

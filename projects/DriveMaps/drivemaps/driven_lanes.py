@@ -26,7 +26,7 @@ _MOST_GAP_M = 30.0  # largest distance between successive positions of one track
 _LEAST_STEP_M = 0.5  # a vehicle that moves less between two positions counts as standing
 _MOST_CROSSING_M = 50.0  # longest stretch without borders, such as a junction, between two lanes
 _LANE_CHANGE_M = 1.0  # the lane changes where its middle moves sideways by more than this in a step
-_FILTER = 5  # points of the median filter along the track
+_FILTER = 5  # points of the median filter along the track, which removes short outliers
 # Largest distance of a point from a point of an earlier pass through its lane. The points of a pass
 # are at most 2 m apart.
 _REPEAT_M = 1.5
@@ -87,9 +87,10 @@ def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLane
         is_repeated = earlier_points[first_point:end_point] >= 0
         # A step between two points is new unless both points repeat an earlier pass.
         is_new = ~(is_repeated[:-1] & is_repeated[1:])
-        states = np.where(is_lane & is_new, lane.kinds, _OUTSIDE)
-        for start, stop in _runs(states):
-            if states[start] != _OUTSIDE:
+        new_kinds = np.where(is_lane & is_new, lane.kinds, _OUTSIDE)
+        for start, stop in _runs(new_kinds):
+            if new_kinds[start] != _OUTSIDE:
+                # Step i leads from point i to point i + 1, so these steps end at point `stop`.
                 stretches.append((first_point + start, first_point + stop))
         first_point = end_point
     points = np.concatenate([lane.centers for lane in lanes])
@@ -119,16 +120,18 @@ def _lane_along(track: FloatArray, borders: shapely.STRtree) -> _Lane:
         track: Positions of the vehicle in metres. (n >= 2, 2)
         borders: Search tree of the dividers and boundaries, from `border_tree`.
     """
-    points = resample(track)
+    points = resample(track)  # in equal steps of at most 2 m
     left_m = border_distances(points, side=1, borders=borders, reach_m=_MOST_APART_M)
     right_m = border_distances(points, side=-1, borders=borders, reach_m=_MOST_APART_M)
     apart_m = left_m + right_m  # infinite where a border is missing
     is_bordered = (apart_m >= _WIDTH_M[0]) & (apart_m <= _MOST_APART_M)
     known = np.flatnonzero(is_bordered & (apart_m <= _WIDTH_M[1]))
-    # Offsets of the centre line to the left of the track. All other points are interpolated.
+    # Offsets of the centre line to the left of the track. They are measured at the known points,
+    # and interpolated at all other points.
     offsets_m = np.zeros(len(points))
     if len(known):
         known_offsets_m = (left_m[known] - right_m[known]) / 2
+        # Before the first and after the last known point, the offset is constant.
         offsets_m = np.interp(np.arange(len(points)), known, known_offsets_m)
     offsets_m = median_filter(offsets_m, size=_FILTER, mode="nearest")
     is_bordered = median_filter(is_bordered, size=_FILTER, mode="nearest")
@@ -194,6 +197,7 @@ def _earlier_points(lanes: Sequence[_Lane]) -> IntArray:
         if len(earlier):
             distances_m = np.linalg.norm(points[earlier] - points[later], axis=1)
             nearest = earlier[distances_m.argmin()]
+            # The nearest point may itself repeat a pass. Then the point of the first pass is used.
             first = earlier_points[nearest]
             earlier_points[later] = nearest if first < 0 else first
     return earlier_points
@@ -223,9 +227,11 @@ def _join_repeats(
         meetings.sort()
         cuts = list(meetings)
         for start, stop in pairwise(meetings):
+            # No piece at the end has fewer points than _LEAST_POINTS.
             cuts += range(start + _MOST_POINTS, stop - _LEAST_POINTS, _MOST_POINTS)
         for start, stop in pairwise(sorted(cuts)):
             indices = np.arange(start, stop + 1)
+            # An end that meets an earlier stretch is replaced by the point of that stretch.
             indices[0] = joints.get(start, start)
             indices[-1] = joints.get(stop, stop)
             centerlines.append(points[indices])
@@ -246,7 +252,7 @@ def _joints(stretches: Sequence[tuple[int, int]], earlier_points: IntArray) -> d
     joints = {}
     ends = [point for stretch in stretches for point in stretch]
     for end in ends:
-        meeting = int(earlier_points[end])
+        meeting = int(earlier_points[end])  # -1, without an earlier pass, is in no stretch
         for first, last in stretches:
             if first <= meeting <= last:
                 if meeting - first < _LEAST_POINTS:

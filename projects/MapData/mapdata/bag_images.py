@@ -28,7 +28,7 @@ _PIXEL_BYTES = {  # bytes of a pixel, by encoding; an encoding that is not liste
     "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4,
     "yuv422_yuy2": 2, "yuyv": 2, "yuv422": 2, "uyvy": 2,
 }  # fmt: skip
-# Formats of compressed messages that are not pictures.
+# Formats of compressed messages that are not pictures: depth images (by their encoding) and video.
 _DEPTHS = ("16UC1", "32FC1")
 _VIDEO = ("h264", "h265", "hevc", "av1", "vp8", "vp9", "theora", "ffmpeg")
 
@@ -39,11 +39,15 @@ def trouble_with(message: Any) -> str | None:
     Args:
         message: Message of ROS: a raw image with ``encoding`` (``sensor_msgs/Image``), or a
             compressed image with ``format`` (``sensor_msgs/CompressedImage``).
+
+    Returns:
+        A clause for a message, in which "it" is the image; or None.
     """
     if hasattr(message, "encoding"):
         if message.encoding in _TO_BGR:
             return None
         return f"it has the encoding {message.encoding!r}; known are {sorted(_TO_BGR)}"
+    # ROS separates the parts of a format by semicolons, as in "16UC1; compressedDepth png".
     image_format = str(message.format)
     if image_format.split(";")[0].strip() in _DEPTHS or "compressedDepth" in image_format:
         return f"it is a depth image ({image_format.strip()!r})"
@@ -53,7 +57,10 @@ def trouble_with(message: Any) -> str | None:
 
 
 def image_size(message: Any) -> tuple[int, int] | None:
-    """Return width and height of a message's image in pixels; None if the image is damaged."""
+    """Return width and height of a message's image in pixels; None if the image is damaged.
+
+    A compressed image is not decoded: its size is in its header.
+    """
     if hasattr(message, "encoding"):
         return int(message.width), int(message.height)
     content = np.asarray(message.data, dtype=np.uint8).tobytes()
@@ -67,6 +74,8 @@ def image_size(message: Any) -> tuple[int, int] | None:
 def write_image(message: Any, camera: RigCamera, target: Path, where: str) -> None:
     """Write a message's image as JPEG. The image is rectified if the camera has distortion.
 
+    A JPEG image of a camera without distortion is copied, so it loses no quality.
+
     Args:
         message: Message of rosbags, with a raw or a compressed image.
         camera: Camera that took the image.
@@ -75,18 +84,20 @@ def write_image(message: Any, camera: RigCamera, target: Path, where: str) -> No
 
     Raises:
         BrokenSampleError: If a compressed image is damaged, or not of the camera's size.
-        ValueError: If the encoding of an image is not known, or a raw image is not of the camera's
-            size.
+        ValueError: If the encoding or the format of an image is not supported, if OpenCV cannot
+            convert it, or if a raw image is not of the camera's size.
     """
     if hasattr(message, "encoding"):
+        # `RigCamera.write_image` rectifies the image if needed, and encodes it as JPEG.
         camera.write_image(target, _raw_image(message, camera.size_px))
         return
     trouble = trouble_with(message)
     if trouble:
         raise InputError(trouble)
     content = np.asarray(message.data, dtype=np.uint8).tobytes()
+    # The image is decoded in any case, as this checks that it is not damaged.
     image = decode_image(content, path="its message", where=where, size=camera.size_px)
-    is_jpeg = content.startswith(b"\xff\xd8")
+    is_jpeg = content.startswith(b"\xff\xd8")  # the first two bytes of every JPEG file
     if camera.is_distorted or not is_jpeg:
         camera.write_image(target, image)
     else:
@@ -94,7 +105,15 @@ def write_image(message: Any, camera: RigCamera, target: Path, where: str) -> No
 
 
 def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
-    """Convert an uncompressed image to BGR. (H, W, 3)"""
+    """Convert an uncompressed image to BGR. (H, W, 3)
+
+    Args:
+        message: Message of the type ``sensor_msgs/Image``.
+        size_px: Expected width and height in pixels.
+
+    Raises:
+        ValueError: If the encoding is not known, or the image has another size.
+    """
     trouble = trouble_with(message)
     if trouble:
         raise InputError(trouble)

@@ -1,4 +1,8 @@
-"""MCAP files with messages of ROS 1, ROS 2 and Foxglove, which may be mixed in one file."""
+"""MCAP files with messages of ROS 1, ROS 2 and Foxglove, which may be mixed in one file.
+
+A channel of a file is a topic with one encoding and one schema, the definition of the message type.
+The summary at the end of a file lists channels and schemas.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,7 +17,7 @@ from mapdata.decompression import begin_bag, import_bounded
 from mapdata.foxglove_messages import ROS_TYPES, foxglove_parser
 from mapdata.ros_bag import Parser, RosTypes, library_errors
 
-MAGIC = b"\x89MCAP0\r\n"
+MAGIC = b"\x89MCAP0\r\n"  # first bytes of every MCAP file
 _ROS_2_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")  # empty: a topic without a definition
 
 
@@ -24,13 +28,15 @@ class McapConnection:
     Args:
         topic: Name of the topic.
         msgtype: Type of the messages. Types of ROS have their names of ROS 2.
-        encoding: Serialization of the messages, such as ``cdr``.
+        encoding: Serialization of the messages: ``cdr`` (ROS 2), ``ros1``, ``protobuf`` (Foxglove),
+            or another one that is not supported.
         schema: Definition of the type as a record of ``mcap``; None without a definition.
     """
 
     topic: str
     msgtype: str
     encoding: str
+    # A schema does not distinguish connections, since each file of a recording may repeat it.
     schema: Any = field(default=None, compare=False)
 
 
@@ -49,7 +55,7 @@ def is_plain_ros2(path: Path) -> bool:
         file.seek(0)
         # `library_errors` turns every error of the library into a ValueError.
         with library_errors():
-            # `import_bounded` limits the memory that a module of mcap may decompress to.
+            # `import_bounded` imports a module of mcap and limits the bytes that it decompresses.
             reader = import_bounded("mcap.reader").make_reader(file)
             if reader.get_header().profile != "ros2":
                 return False
@@ -86,7 +92,7 @@ class McapBag:
         Raises:
             ValueError: If a file is damaged.
         """
-        begin_bag()  # counts decompressed bytes from 0
+        begin_bag()  # the limit of decompressed bytes is for one bag: they are counted from 0
         self._types = RosTypes()
         for path in self.paths:
             with library_errors(), path.open("rb") as file:
@@ -108,8 +114,14 @@ class McapBag:
     ) -> Iterator[tuple[McapConnection, int, bytes]]:
         """Yield the messages of some connections, file by file.
 
+        Within a file, messages are in order of time if the file has an index, or else in the order
+        of the file.
+
+        Args:
+            connections: Connections of this bag.
+
         Yields:
-            Connection, time in nanoseconds and content of a message.
+            Connection, time of recording in nanoseconds, and serialized content of a message.
         """
         selected = set(connections)
         topics = sorted({connection.topic for connection in selected})
@@ -130,7 +142,9 @@ class McapBag:
                         yield connection, message.log_time, message.data
 
     def parser(self, connection: McapConnection) -> Parser:
-        """Function that parses the messages of a connection.
+        """Function from the content of a message of a connection to the parsed message.
+
+        It is created once for each connection.
 
         Raises:
             ValueError: If the encoding or the type of the messages is not supported.
@@ -163,7 +177,11 @@ def _read_channels(file: Any) -> tuple[dict[int, Any], dict[int, Any], dict[int,
 
 
 def _connection_of(channel: Any, schema: Any) -> McapConnection:
-    """Connection of a channel, with the type named as in ROS 2."""
+    """Connection of a channel, with the type named as in ROS 2.
+
+    ``ROS_TYPES`` has the ROS type of each Foxglove type that can be converted. A type of ROS 1,
+    such as ``sensor_msgs/Image``, is named ``sensor_msgs/msg/Image`` in ROS 2.
+    """
     name = "" if schema is None else schema.name
     encoding = channel.message_encoding
     if encoding == "protobuf":
@@ -187,14 +205,23 @@ def _create_parser(connection: McapConnection, types: RosTypes) -> Parser:
     """Create a function that parses the messages of a connection.
 
     The caller adds the name of the topic to the message of an error.
+
+    Args:
+        connection: The connection.
+        types: Types of ROS messages in this bag.
+
+    Raises:
+        ValueError: If the encoding or the type of the messages is not supported.
     """
     schema = connection.schema
     encoding = connection.encoding
     with library_errors():
         if encoding == "protobuf" and schema is not None and schema.name in ROS_TYPES:
+            # This parser also converts the messages to messages of ROS.
             return foxglove_parser(schema.name, schema.data)
         if encoding not in ("cdr", "ros1"):
             raise InputError(f"its messages are in the encoding {encoding!r}")
         definition = "" if schema is None else schema.data.decode()
+        # ROS 2 definitions are written in IDL or in the format of .msg files.
         is_idl = schema is not None and schema.encoding in ("ros2idl", "omgidl")
     return types.parser(connection.msgtype, definition, is_idl=is_idl, is_ros1=encoding == "ros1")

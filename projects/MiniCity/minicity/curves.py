@@ -1,4 +1,7 @@
-"""Geometry of polylines in the plane."""
+"""Geometry of polylines in the plane.
+
+The arc length of a point is its distance from the start, measured along the polyline.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +10,7 @@ Array = NDArray[np.float64]
 
 
 def arc_lengths(points: Array) -> Array:
-    """Distance along a polyline at each of its points, in metres. (n, 2) -> (n,)"""
+    """Arc length of each point of a polyline, in metres. (n, 2) -> (n,)"""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -32,7 +35,7 @@ def interpolate(values: Array, lengths: Array, at: Array) -> Array:
 
     Args:
         values: One row per arc length. (n, D)
-        lengths: Ascending arc lengths in metres. (n,)
+        lengths: Ascending arc lengths of the rows, in metres. (n >= 2,)
         at: Arc lengths of the result in metres, clipped to the range of ``lengths``. (k,)
 
     Returns:
@@ -40,6 +43,7 @@ def interpolate(values: Array, lengths: Array, at: Array) -> Array:
     """
     # `at` lies between the rows `left` and `left + 1`.
     left = np.clip(np.searchsorted(lengths, at, side="right") - 1, 0, len(lengths) - 2)
+    # Repeated vertices have a span of 0. The small value avoids a division by 0.
     span = np.maximum(lengths[left + 1] - lengths[left], 1e-12)
     share = np.clip((at - lengths[left]) / span, 0.0, 1.0)[:, None]
     return values[left] + share * (values[left + 1] - values[left])
@@ -64,6 +68,7 @@ def subline(points: Array, start_m: float, end_m: float) -> Array:
 
 def tangents(points: Array) -> Array:
     """Unit direction of travel at each point of a polyline. (n, 2) -> (n, 2)"""
+    # Half of the step from the previous to the next point; at an end, the step to its neighbour.
     steps = np.gradient(points, axis=0)
     return steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
 
@@ -75,7 +80,7 @@ def left_normals(points: Array) -> Array:
 
 
 def offset(points: Array, distance_m: float) -> Array:
-    """Shift a polyline to its left by a distance in metres. (n, 2) -> (n, 2)"""
+    """Shift a polyline to its left by a distance in metres; < 0 to its right. (n, 2) -> (n, 2)"""
     return points + distance_m * left_normals(points)
 
 
@@ -90,13 +95,15 @@ def hermite(
         end: Last point in metres. (2,)
         end_dir: Unit direction of travel at the end. (2,)
         count: Number of points, >= 2.
-        pull: Length of the end tangents relative to the distance between the ends.
+        pull: Length of the end tangents relative to the distance between the ends. With longer
+            tangents, the curve keeps the end directions for a longer way.
 
     Returns:
         Points at equal steps of the curve's parameter. (count, 2)
     """
     t = np.linspace(0.0, 1.0, num=count)[:, None]  # parameter of the curve
     reach = pull * float(np.linalg.norm(end - start))
+    # The polynomials weigh the start, the tangent at the start, the end and the tangent at the end.
     return (
         (2 * t**3 - 3 * t**2 + 1) * start
         + (t**3 - 2 * t**2 + t) * reach * start_dir
@@ -135,8 +142,10 @@ def rectangle(center: Array, yaw_rad: float, length_m: float, width_m: float) ->
     """
     c = np.cos(yaw_rad)
     s = np.sin(yaw_rad)
+    # Corners before the rotation. (4, 2)
     corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length_m, width_m]
-    return corners @ np.array([[c, s], [-s, c]]) + center  # row vectors: the transposed rotation
+    # Points are rows here, so the matrix is the transpose of a rotation by the yaw.
+    return corners @ np.array([[c, s], [-s, c]]) + center
 
 
 def unit(yaw_rad: float) -> Array:

@@ -1,4 +1,7 @@
-"""Junctions: outlines between the mouths of their roads, and driving paths across them."""
+"""Junctions: outlines between the mouths of their roads, and driving paths across them.
+
+A mouth is the cross-section of a road where it meets a junction.
+"""
 
 from dataclasses import dataclass
 
@@ -16,7 +19,7 @@ class Junction:
     """Junction of three or four roads.
 
     Attributes:
-        node: Index of the node.
+        node: Index of the node of the road network that the junction lies at.
         outline: Closed outline of kerbs and road mouths in metres, anticlockwise. (n, 2)
         corners: Kerb lines between neighbouring roads, in metres. Each (m, 2)
         arms: Index of each road, and whether the road starts here; anticlockwise.
@@ -44,7 +47,7 @@ class Connector:
 
 
 def mouth(road: Road, at_start: bool) -> Array:
-    """Mouth of a road: its cross-section where it meets a junction.
+    """Points of the mouth of a road at a junction.
 
     The points go from the right kerb to the left kerb, as seen by a driver who leaves the junction.
 
@@ -82,9 +85,9 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
     mouths = [mouth(roads[r], at_start) for r, at_start in arms]
     outward = [_outward(roads[r], at_start) for r, at_start in arms]
     corners = []
-    ring = []
+    ring = []  # mouths and corners in turn
     for i in range(len(arms)):
-        j = (i + 1) % len(arms)
+        j = (i + 1) % len(arms)  # next road anticlockwise
         # The corner leads from the left kerb of road i, along the junction, to the right kerb of
         # road j. The tangents at its ends (`pull`) are longer for sharper turns.
         turn_rad = float(np.arccos(np.clip(-outward[i] @ outward[j], -1, 1)))
@@ -104,9 +107,10 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
 def _turning_angle(source: Lane, target: Lane) -> float:
     """Angle in radians from the end of one lane to the start of another, positive to the left."""
     # The signed angle is the arctangent of the cross product over the dot product.
-    a = source.center[-1] - source.center[-2]
-    b = target.center[1] - target.center[0]
-    return float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
+    last_step = source.center[-1] - source.center[-2]
+    first_step = target.center[1] - target.center[0]
+    cross = last_step[0] * first_step[1] - last_step[1] * first_step[0]
+    return float(np.arctan2(cross, last_step @ first_step))
 
 
 def _choose_target(source: Lane, lanes_in: int, targets: list[Lane]) -> Lane | None:
@@ -125,16 +129,18 @@ def _choose_target(source: Lane, lanes_in: int, targets: list[Lane]) -> Lane | N
         return targets[0] if source.index == 0 else None
     if angle < -STRAIGHT_RAD:  # a right turn, from the outermost lane to the outermost one
         return targets[-1] if source.index == lanes_in - 1 else None
-    # Straight on, into the lane with the index of `source` or else into the outermost lane.
+    # Straight on, into the lane with the index of `source`, or into the outermost lane if the road
+    # has fewer lanes.
     return targets[min(source.index, len(targets) - 1)]
 
 
 def make_connectors(junction: Junction, lanes_by_road: dict[int, list[Lane]]) -> list[Connector]:
-    """Make all permitted paths across a junction.
+    """Make all permitted paths across a junction. There are no U-turns.
 
     Args:
         junction: The junction.
-        lanes_by_road: Lanes of every road of the town, by road index.
+        lanes_by_road: Lanes of every road of the town, by road index. The lanes of each direction
+            go from the innermost to the outermost one, as `Road.lanes` returns them.
 
     Returns:
         One path per permitted turn of each lane.
@@ -162,13 +168,13 @@ def make_connectors(junction: Junction, lanes_by_road: dict[int, list[Lane]]) ->
 
 def _connector_path(source: Lane, target: Lane) -> Array:
     """Smooth curve from the end of one lane to the start of another, in metres. (16, 2)"""
-    a = source.center[-1] - source.center[-2]
-    b = target.center[1] - target.center[0]
+    last_step = source.center[-1] - source.center[-2]
+    first_step = target.center[1] - target.center[0]
     return hermite(
         start=source.center[-1],
-        start_dir=a / np.linalg.norm(a),
+        start_dir=last_step / np.linalg.norm(last_step),
         end=target.center[0],
-        end_dir=b / np.linalg.norm(b),
+        end_dir=first_step / np.linalg.norm(first_step),
         count=16,
         pull=1.1,
     )

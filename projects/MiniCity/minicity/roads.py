@@ -58,6 +58,7 @@ class CrossSection:
     @property
     def all_offsets(self) -> list[float]:
         """Offsets at which a lane, median or kerb edge meets a junction, from right to left."""
+        # A set, since neighbours without a median or a shoulder share an edge.
         edges = {self.right_m, self.left_m, *self.forward_edges, *self.backward_edges}
         return sorted(edges)
 
@@ -127,9 +128,10 @@ class Road:
         center: Centre line from mouth to mouth, in metres. (n, 2)
         section: Lanes across the road.
         style: Paint and surface.
-        crossings: Arc lengths (start, end) of pedestrian crossings.
+        crossings: Arc lengths (start, end) of pedestrian crossings, in any order.
         clear_start_m: Arc length at which divider paint begins.
-        clear_end_m: Arc length at which divider paint ends; 0 is replaced by the whole length.
+        clear_end_m: Arc length at which divider paint ends. 0, the default, is replaced by the
+            whole length.
         stop_forward: Arc lengths (start, end) of the stop line for forward lanes, or None.
         stop_backward: Arc lengths (start, end) of the stop line for backward lanes, or None.
         shift_m: Shift of the painted lines between lanes from the offsets of ``section``, in
@@ -153,7 +155,8 @@ class Road:
         """Compute the arc lengths and normals of the centre line."""
         self._lengths = arc_lengths(self.center)
         self._normals = left_normals(self.center)
-        self.clear_end_m = self.clear_end_m or self.length_m
+        if self.clear_end_m == 0:
+            self.clear_end_m = self.length_m
 
     @property
     def length_m(self) -> float:
@@ -211,13 +214,15 @@ class Road:
                 line = self.line(offset_m)
                 start_points.append(line[0])
                 end_points.append(line[-1])
-        # Along the right side, across the end, back along the left side, and across the start.
-        start = np.array(start_points[::-1]).reshape(-1, 2)
+        # Along the right side, across the end, back along the left side, and across the start. The
+        # points across the start go from left to right, so their order is reversed.
+        start = np.array(start_points[::-1]).reshape(-1, 2)  # (0, 2) without points
         end = np.array(end_points).reshape(-1, 2)
         return np.concatenate([self.line(right_m), end, self.line(left_m)[::-1], start])
 
     def direction(self, at_m: float) -> float:
         """Heading of the centre line at an arc length, in radians anticlockwise from +x."""
+        # The interpolated tangent is shorter than 1 in a bend, but only its direction is used.
         step = interpolate(tangents(self.center), self._lengths, at=np.array([at_m]))[0]
         return float(np.arctan2(step[1], step[0]))
 
@@ -300,19 +305,21 @@ class Road:
             at_start: Whether the crossing lies at the start of the centre line.
             stop: Whether to add a stop line before the crossing.
         """
-        # `far` (far side of the crossing) and `clear` (start of the paint) are distances from this
-        # end of the road. Vehicles that drive towards the start of the road use backward lanes.
-        far = start_m + depth_m
+        # `far_m` (far side of the crossing) and `clear_m` (start of the paint) are distances from
+        # this end of the road. Vehicles that drive towards the start of the road use backward
+        # lanes.
+        far_m = start_m + depth_m
         bare_m = STOP_GAP_M + STOP_LINE_M if stop else _BARE_M
-        clear = far + bare_m
+        clear_m = far_m + bare_m
         if at_start:
-            self.crossings.append((start_m, far))
-            self.clear_start_m = clear
+            self.crossings.append((start_m, far_m))
+            self.clear_start_m = clear_m
             if stop:
-                self.stop_backward = (far + STOP_GAP_M, clear)
+                self.stop_backward = (far_m + STOP_GAP_M, clear_m)
         else:
-            length = self.length_m
-            self.crossings.append((length - far, length - start_m))
-            self.clear_end_m = length - clear
+            # Arc lengths count from the other end, so the distances are subtracted.
+            length_m = self.length_m
+            self.crossings.append((length_m - far_m, length_m - start_m))
+            self.clear_end_m = length_m - clear_m
             if stop:
-                self.stop_forward = (length - clear, length - far - STOP_GAP_M)
+                self.stop_forward = (length_m - clear_m, length_m - far_m - STOP_GAP_M)

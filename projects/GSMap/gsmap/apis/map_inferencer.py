@@ -70,7 +70,7 @@ def select_samples(
     if wanted is not None:
         index_by_token = {token: index for index, token in enumerate(tokens)}
         indices = []
-        for token in wanted:
+        for token in wanted:  # in the given order
             if token not in index_by_token:
                 raise InputError(
                     f"No sample has the token {token!r}; there are {len(tokens)} samples."
@@ -102,8 +102,9 @@ def _build_visualizer(cfg: Config) -> "MapVisualizer":
 
     options = dict(cfg.get("visualizer") or {})
     kind = str(options.pop("type", "MapVisualizer"))
-    if kind.split(".")[-1] != "MapVisualizer":  # options of another class
+    if kind.split(".")[-1] != "MapVisualizer":  # the options are for another class
         options = {}
+    # The inferencer returns figures. It needs no backends that store them in a folder.
     for name in ("name", "vis_backends", "save_dir"):
         options.pop(name, None)
     with building(cfg, kind=MapVisualizer):  # errors name the config and the part
@@ -145,36 +146,45 @@ class MapInferencer:
     ):
         self.model = load_model(config, checkpoint=checkpoint, cfg_options=cfg_options)
         self.cfg: Config = self.model.cfg
+        # True until the user has been warned about a model that was trained on generated images.
         self._warn_generated = self.model.training_dataset == _GENERATED
         self.amp = amp
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        names = [device] if isinstance(device, str | torch.device) else list(device)
-        self.devices = [torch.device(name) for name in names]
-        copies = [copy.deepcopy(self.model) for _ in names[1:]]
+        given_devices = [device] if isinstance(device, str | torch.device) else list(device)
+        self.devices = [torch.device(name) for name in given_devices]
+        # The first device takes the model itself, and each further device takes a copy.
+        copies = [copy.deepcopy(self.model) for _ in self.devices[1:]]
         self.replicas: list[Any] = []
         self._fast_frames: list[FastFrames | None] = []
-        for model, place in zip([self.model, *copies], self.devices, strict=True):
-            replica = model.to(place)
+        for model, target in zip([self.model, *copies], self.devices, strict=True):
+            replica = model.to(target)
             self.replicas.append(replica)
-            fast_frames = self._build_fast_frames(replica, device=place, cuda_graphs=cuda_graphs)
+            fast_frames = self._build_fast_frames(replica, device=target, cuda_graphs=cuda_graphs)
             self._fast_frames.append(fast_frames)
-        # Camera embeddings as trained. `_fit_cameras` replaces them in the replicas.
+        # Camera embeddings as trained, one row per camera of the model; None for a model without.
+        # `_fit_cameras` replaces them in the replicas, so the original is kept here.
         self._camera_embeds = getattr(self.model.bev_encoder, "cams_embeds", None)
         self.visualizer = _build_visualizer(self.cfg)
+        # Folder of the annotation files that `dataset` writes, and the number of these files.
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
         self._num_files = 0
 
     def _build_fast_frames(
         self, model: Any, device: torch.device, cuda_graphs: bool | None
     ) -> FastFrames | None:
-        """Build the predictor of recorded frames; None if ``test_step`` runs the frames.
+        """Build the predictor that records and replays frames as CUDA graphs.
 
-        With mixed precision on a GPU, also switch the model to a backbone in float16.
+        The result is None if frames are not recorded; `_step` then calls ``test_step``. With mixed
+        precision on a GPU, also switch the model to a backbone in float16.
 
         Args:
             model: Replica of the model.
             device: Device of the replica.
             cuda_graphs: As in the constructor.
+
+        Raises:
+            ValueError: If ``cuda_graphs`` is True on another device than a GPU, or for a model
+                without a static form.
         """
         if device.type != "cuda":
             if cuda_graphs:
@@ -182,7 +192,7 @@ class MapInferencer:
             return None
         if self.amp and model.img_backbone is not None:
             model.halve_backbone()
-        reason = reason_against(model)
+        reason = reason_against(model)  # why the model has no static form; empty if it has one
         if cuda_graphs and reason:
             raise InputError(
                 f"cuda_graphs=True cannot be used with this model: {reason}. Leave it out."
@@ -215,7 +225,7 @@ class MapInferencer:
         """
         self._num_files += 1
         root = None if data_root is None else Path(data_root)
-        mount = self.model.mount
+        mount = self.model.mount  # annotation frame of the model, and its pose on the vehicle
         if isinstance(source, str | Path):
             source = open_annotations(source, root)
         if isinstance(source, Source):
@@ -256,18 +266,19 @@ class MapInferencer:
         if trained is None or dataset.cameras is None:
             return dataset
         if allow_missing_cameras:
-            available: set[str] = set()
+            available: set[str] = set()  # cameras that a sample or more has
             for index in range(len(dataset)):
                 for camera in dataset.sample(index).cameras:
                     available.add(camera.name)
             cameras = tuple(name for name in dataset.cameras if name in available)
             if cameras:
-                dataset = copy.copy(dataset)
+                dataset = copy.copy(dataset)  # the caller's data set keeps its cameras
                 dataset.cameras = cameras
         if self._camera_embeds is None:
             return dataset
         from gsmap.apis.rig_fit import camera_rows
 
+        # For each camera of the data set, the index of the trained camera that it is treated as.
         rows = camera_rows(dataset, trained=trained)
         for replica, device in zip(self.replicas, self.devices, strict=True):
             embeds = self._camera_embeds.detach()[rows].to(device)  # (V, C)
@@ -299,7 +310,8 @@ class MapInferencer:
             raise FileNotFoundError(f"There is no LiDAR sweep {path}.")
         from gsmap.datasets.transforms.points import read_points
 
-        points = read_points(str(path), 5)[:, :3]  # (n, 3)
+        # A point in nuScenes' format has 5 values, of which x, y and z are used.
+        points = read_points(str(path), 5)[:, :3]  # (n, 3), LiDAR frame
         rotation = lidar.frame_from_lidar[:3, :3]
         translation = lidar.frame_from_lidar[:3, 3]
         return points @ rotation.T + translation
@@ -342,12 +354,13 @@ class MapInferencer:
                 model with memory, if frames are out of order, or there are several devices; if a
                 prior is given to a model without one, or does not fit the samples.
         """
-        num_ahead = len(self.replicas)  # batches that are computed ahead of the yielded one
+        # Batches that are computed ahead of the yielded one. One per replica keeps them busy.
+        num_ahead = len(self.replicas)
         if stream is not None:
             num_ahead = 0  # the caller's stream is then at most a batch ahead of the samples
             self._temporal()  # raises an error if the model has no memory
         elif self.model.temporal is not None:
-            stream = self._temporal().new_scenes()
+            stream = self._temporal().new_scenes()  # a memory for each scene of the samples
         maps = self._maps(priors, update=update_priors)
         dataset = self._fit_cameras(dataset, allow_missing_cameras=allow_missing_cameras)
         frames = FrameDataset(dataset, blank_cameras=allow_missing_cameras)
@@ -356,9 +369,10 @@ class MapInferencer:
             subset, batch_size=batch_size, num_workers=num_workers, collate_fn=collate
         )
         with ExitStack() as stack:
-            # One thread for each replica.
+            # One thread for each replica, so that it computes one batch at a time, in order.
             pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in self.replicas]
             pending: deque[Future] = deque()
+            # `batch` has the usable samples, and is None if all samples are in `broken`.
             for number, (batch, broken) in enumerate(batches):
                 for frame in broken:
                     if on_broken is None:
@@ -373,6 +387,8 @@ class MapInferencer:
                         )
                         pending.append(future)
                 if len(pending) > num_ahead:
+                    # `result_of` waits for the result. Unlike in `Future.result`, a signal that
+                    # interrupts the wait does no harm.
                     yield from result_of(pending.popleft())
             while pending:
                 yield from result_of(pending.popleft())
@@ -388,7 +404,11 @@ class MapInferencer:
         return self._temporal().new_stream()
 
     def _temporal(self) -> Any:
-        """Temporal part of the model; ValueError if it has none, or there are several devices."""
+        """Part of the model that remembers earlier frames.
+
+        Raises:
+            ValueError: If the model has no such part, or there are several devices.
+        """
         if self.model.temporal is None:
             raise InputError("the model has no memory (temporal): leave the stream out.")
         if len(self.devices) > 1:
@@ -399,8 +419,12 @@ class MapInferencer:
         """Maps that the samples of a call read; None for a model without a prior.
 
         Args:
-            priors: Maps of earlier drives; none to start from an empty map.
+            priors: Maps of earlier drives. If there are none, the samples start from an empty map.
             update: Write each sample to ``priors``.
+
+        Raises:
+            ValueError: If the model takes no prior, if a prior does not fit it, or if a model with
+                a prior is on several devices.
         """
         if priors:
             maps = maps_for(self.model, priors, update=update)
@@ -419,19 +443,24 @@ class MapInferencer:
         """Predict a batch on one device.
 
         Args:
-            turn: Index of the device.
-            batch: Inputs and data samples.
+            turn: Index of the device, and of its replica.
+            batch: ``inputs`` and ``data_samples``, as `collate` returns them.
             stream: Drive or scenes of the samples, for a model with memory.
             maps: Maps that the samples read, for a model with a prior.
+
+        Returns:
+            The samples with ``pred_instances_3d``, on the CPU.
         """
         model = self.replicas[turn]
         device_type = self.devices[turn].type
         fast_frames = self._fast_frames[turn]
         if fast_frames is not None and fast_frames.serves(batch):
             return fast_frames(batch)  # such a model has neither a memory nor a prior
+        # In these contexts, the model uses the caller's memory and maps in place of those it has.
         memory = nullcontext() if stream is None else self.model.temporal.using(stream)
         prior = nullcontext() if maps is None else self.model.prior.using(maps)
         in_bfloat16 = self.amp and device_type == "cpu"
+        # `half_backbone` is only set for mixed precision on a GPU (`_build_fast_frames`).
         with (
             memory,
             prior,
@@ -460,7 +489,7 @@ class MapInferencer:
             frame: Frame of the transforms: ``vehicle``, ``lidar`` or ``ego``, see `LiveMap`. By
                 default the frame of the config.
             allow_missing_cameras: Whether cameras of the model may be absent.
-            can_bus: Vehicle signals, or None. (18,)
+            can_bus: Vehicle signals, as `LiveMap.predict` takes them, or None. (18,)
 
         Returns:
             The sample with ``pred_instances_3d``, in the annotation frame of the config.
@@ -496,6 +525,9 @@ class MapInferencer:
             allow_missing_cameras: Whether cameras of the model may be absent.
             prior: Map of earlier drives, for a model that reads one.
             update_prior: Write each frame to ``prior`` after it is predicted.
+
+        Returns:
+            The predictor. It uses the model of this inferencer, not a copy.
         """
         return LiveMap(
             self,
@@ -512,7 +544,10 @@ class MapInferencer:
         return elements_of_predictions(data_sample.pred_instances_3d)
 
     def vectors(self, data_sample: "Det3DDataSample") -> list[dict[str, Any]]:
-        """Map elements of a predicted sample in the format of the results JSON."""
+        """Map elements of a predicted sample in the format of the results JSON.
+
+        The class names are read from the data set that `dataset` created last.
+        """
         return vectors_of(self.elements(data_sample), self.visualizer.dataset_meta["classes"])
 
     def draw(self, data_sample: "Det3DDataSample", **options: Any) -> "Figure":

@@ -1,6 +1,7 @@
 """Conversion of state dicts between the format of this project and the upstream format.
 
-"Upstream" is the code that the authors of a model have released.
+"Upstream" is the code that the authors of a model have released. The key map (`KeyMap`) of an
+architecture has the rules that rename the keys of its weights in both directions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,9 @@ def summarize_names(names: Sequence[str], max_names: int = 3) -> str:
     Args:
         names: State keys, or other names.
         max_names: Number of names to write out.
+
+    Returns:
+        Text such as ``a, b, c and 5 more``; ``nothing`` without names.
     """
     if not names:
         return "nothing"
@@ -30,20 +34,22 @@ def summarize_names(names: Sequence[str], max_names: int = 3) -> str:
 def ours_from_upstream(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Rename the keys of an upstream state to the keys of this project.
 
-    The key map (`KeyMap`) of the architecture has the rules of the names. Keys that it marks as
-    unused are left out.
+    Keys that the key map marks as unused have no counterpart in this project. They are left out.
 
     Args:
         state: Weights by upstream key.
 
+    Returns:
+        Weights by the keys of this project. The tensors are not copied.
+
     Raises:
-        ValueError: If the key map does not contain a key.
+        ValueError: If the key map does not contain a key, or ``state`` is empty.
     """
     key_map = find_key_map(state)
     renamed: dict[str, Tensor] = {}
     unknown: list[str] = []
     for key, value in state.items():
-        name = key_map.to_ours(key)
+        name = key_map.to_ours(key)  # None if the key is unused or not known
         if name is not None:
             renamed[name] = value
         elif not key_map.is_unused(key):
@@ -62,14 +68,18 @@ def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Args:
         state: Weights by the keys of this project.
 
+    Returns:
+        Weights by upstream key. Tensors of ``state`` are not copied.
+
     Raises:
-        ValueError: If a weight outside of the auxiliary heads has no upstream key.
+        ValueError: If a weight outside of the auxiliary heads has no upstream key, or ``state`` is
+            empty.
     """
     key_map = find_key_map(state)
     renamed: dict[str, Tensor] = {}
     unknown: list[str] = []
     for key, value in state.items():
-        name = key_map.to_upstream(key)
+        name = key_map.to_upstream(key)  # None if no rule matches
         if name is not None:
             renamed[name] = value
         elif not key.startswith(_TRAINING_ONLY):
@@ -82,7 +92,8 @@ def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     # For each key that only upstream has, `unused` contains a constant weight, or None.
     for key, constant in key_map.unused.items():
         if constant is not None:  # None marks a key that only some upstream models have
-            # Some constants are expanded tensors, whose elements share memory.
+            # Some constants are expanded tensors, whose elements share memory. A clone in this
+            # format has memory for each element.
             renamed[key] = constant.clone(memory_format=torch.contiguous_format)
     return renamed
 
@@ -97,7 +108,8 @@ def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
         The converted state, and a description of the conversion for a log.
 
     Raises:
-        ValueError: If a key belongs to no known architecture.
+        ValueError: If a key belongs to no known architecture, if upstream's architecture lacks a
+            weight outside of the auxiliary heads, or if ``state`` is empty.
     """
     key_map = find_key_map(state)
     if is_upstream(state):

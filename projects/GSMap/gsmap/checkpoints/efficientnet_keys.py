@@ -4,7 +4,9 @@ from torch import Tensor
 
 from gsmap.checkpoints.key_rules import Rules, rules_of, zeros
 
-_BLOCKS_PER_STAGE = (1, 2, 2, 6, 5)  # upstream numbers the blocks of all stages consecutively
+# Number of blocks in each stage of mmdet's backbone. Upstream has no stages: it numbers the blocks
+# consecutively.
+_BLOCKS_PER_STAGE = (1, 2, 2, 6, 5)
 _NORM_PARAMETERS = ("weight", "bias", "running_mean", "running_var")
 
 
@@ -18,14 +20,17 @@ def efficientnet_rules(theirs: str, ours: str) -> Rules:
     Returns:
         Pairs of key prefixes: first the upstream prefix, then the prefix in this project.
     """
-    # Each entry of `names` is the upstream name, "=", and the name in this project.
+    # `rules_of` splits `names` at blanks. Each entry is the upstream name, "=", and the name in
+    # this project, without the prefixes.
     rules = rules_of(upstream=theirs, ours=f"{ours}layers.0.", names="_conv_stem.=conv. _bn0.=bn.")
     upstream_block = 0
-    for stage, num_blocks in enumerate(_BLOCKS_PER_STAGE, start=1):
+    for stage, num_blocks in enumerate(_BLOCKS_PER_STAGE, start=1):  # layer 0 is the stem
         for block in range(num_blocks):
             rules += rules_of(
                 upstream=f"{theirs}_blocks.{upstream_block}._",
                 ours=f"{ours}layers.{stage}.{block}.",
+                # Upstream numbers the norms of a block 0, 1 and 2: after the expansion, after the
+                # depthwise convolution and after the projection. `se` is squeeze and excitation.
                 names=(
                     "expand_conv.=expand_conv.conv. bn0.=expand_conv.bn. "
                     "depthwise_conv.=depthwise_conv.conv. bn1.=depthwise_conv.bn. "
@@ -61,7 +66,7 @@ def unused_classifier(theirs: str) -> dict[str, Tensor]:
         theirs: Prefix of the keys of ``efficientnet_pytorch``.
 
     Returns:
-        Zeros by upstream key.
+        Zeros by upstream key, for states that are converted to upstream's format.
     """
     shapes: dict[str, tuple[int, ...]] = {
         "_conv_head.weight": (1280, 320, 1, 1),

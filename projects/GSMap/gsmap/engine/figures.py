@@ -16,14 +16,17 @@ _MAX_ROWS = 1000  # largest number of rows in the queue, one for each iteration
 
 
 class _Waiting:
-    """Queue of device values that have not been copied to their histories, oldest first."""
+    """Queue of device values that have not been copied to their histories, oldest first.
+
+    Each row has the values of one iteration: their histories, and a tensor with one value for each.
+    """
 
     def __init__(self) -> None:
         self.rows: list[tuple[Sequence[LateHistory], Tensor]] = []
 
     def add(self, histories: Sequence["LateHistory"], values: Tensor) -> None:
         """Queue one value for each history. (len(histories),)"""
-        if len(self.rows) >= _MAX_ROWS:
+        if len(self.rows) >= _MAX_ROWS:  # bounds the memory without log lines
             self.read()
         self.rows.append((histories, values))
 
@@ -57,6 +60,7 @@ class LateHistory(HistoryBuffer):
     def __init__(self, history: HistoryBuffer, waiting: _Waiting) -> None:
         self._waiting = waiting
         values, counts = history.data
+        # The base class stores both arrays by the setters of the two properties below.
         super().__init__(values, counts, max_length=history.max_length)
 
     @property
@@ -81,17 +85,18 @@ class LateHistory(HistoryBuffer):
 
     def extend(self, values: Sequence[float]) -> None:
         """Append values, one per iteration."""
-        counts = [1] * len(values)
+        counts = [1] * len(values)  # each value is one scalar, not a sum
         self._values = np.append(self._values, values=values)[-self.max_length :]
         self._counts = np.append(self._counts, values=counts)[-self.max_length :]
 
+    # A copy or pickle is a plain history with all values, without the queue.
     def __reduce__(self) -> Any:
         values, counts = self.data
         return HistoryBuffer, (values, counts, self.max_length)
 
 
 def _waiting_values(scalars: Mapping[str, HistoryBuffer]) -> _Waiting:
-    """Return the queue that the histories of a message hub share; a new queue if there is none."""
+    """Return the queue that all late histories of a message hub share, or else a new queue."""
     for history in scalars.values():
         if isinstance(history, LateHistory):
             return history._waiting
@@ -114,7 +119,7 @@ def keep_figures(hub: MessageHub, figures: Mapping[str, Any]) -> None:
     values: list[Tensor] = []
     for name, value in figures.items():
         on_device = isinstance(value, Tensor) and value.device.type != "cpu"
-        # The first value of a scalar is not deferred, since mmengine then creates its history.
+        # The first value of a scalar is not deferred: `update_scalar` creates the history.
         if not on_device or name not in scalars:
             hub.update_scalar(name, value)
             continue
@@ -142,6 +147,9 @@ class MapRuntimeInfoHook(RuntimeInfoHook):
     ) -> None:
         """Add the scalars of an iteration to the message hub.
 
+        The base class would copy each scalar to the host, and so wait for the GPU. Its method is
+        therefore not called.
+
         Args:
             runner: Runner of the training.
             batch_idx: Index of the iteration within its epoch; not used.
@@ -152,7 +160,7 @@ class MapRuntimeInfoHook(RuntimeInfoHook):
         keep_figures(runner.message_hub, figures=scalars)
 
     def after_train_epoch(self, runner: Runner) -> None:
-        """Check the losses of the last iteration."""
+        """Check the losses of the last iteration of the epoch."""
         finish_checks(runner)
 
     def after_train(self, runner: Runner) -> None:
@@ -162,7 +170,10 @@ class MapRuntimeInfoHook(RuntimeInfoHook):
 
 
 def finish_checks(runner: Runner) -> None:
-    """Check the losses that a model has not checked yet.
+    """Check the losses that a model has not checked yet. A model without checks is left alone.
+
+    Args:
+        runner: Runner of the training. Its model may be wrapped for distributed training.
 
     Raises:
         FloatingPointError: If a loss is not finite.

@@ -1,4 +1,4 @@
-"""Rigid transforms."""
+"""Rigid transforms: 4 x 4 matrices of a rotation and a translation with last row 0, 0, 0, 1."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def invert_rigid(transform: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     ``np.linalg.inv`` of thousands of small matrices spends most of its time on starting threads.
 
     Args:
-        transform: Rotations with translations. (..., 4, 4)
+        transform: Rigid transforms. This is not checked. (..., 4, 4)
 
     Returns:
         Inverses. (..., 4, 4)
@@ -35,13 +35,15 @@ def invert_rigid(transform: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     if matrices.shape[-2:] != (4, 4):
         raise InputError(f"transform must have shape (..., 4, 4), got {matrices.shape}.")
     inverse = np.zeros_like(matrices)
-    rotation = matrices[..., :3, :3].swapaxes(-1, -2)
-    inverse[..., :3, :3] = rotation
-    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, matrices[..., :3, 3])
+    # The inverse of a rotation R is its transpose, and the inverse of a translation t is -R^T t.
+    inverse_rotation = matrices[..., :3, :3].swapaxes(-1, -2)
+    inverse[..., :3, :3] = inverse_rotation
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", inverse_rotation, matrices[..., :3, 3])
     inverse[..., 3, 3] = 1.0
     return inverse
 
 
+# Matrices with infinite or huge entries are not rigid. numpy must not warn about them.
 @np.errstate(invalid="ignore", over="ignore")
 def is_rigid(transform: NDArray[np.floating[Any]], tolerance: float = 1e-3) -> NDArray[np.bool_]:
     """Test whether matrices are proper rotations with finite translations.
@@ -51,7 +53,7 @@ def is_rigid(transform: NDArray[np.floating[Any]], tolerance: float = 1e-3) -> N
         tolerance: Largest error of the dot and cross products of the rows of a rotation.
 
     Returns:
-        Whether a matrix is rigid. (...)
+        Whether each matrix is rigid, False if an entry is not finite. (...)
     """
     m = np.moveaxis(transform, (-2, -1), (0, 1)).copy()  # (4, 4, ...), each entry contiguous
     x, y, z = m[:3, :3]
@@ -61,7 +63,7 @@ def is_rigid(transform: NDArray[np.floating[Any]], tolerance: float = 1e-3) -> N
     cross_error = np.cross(x, y, axis=0) - z
     errors = [(x * x).sum(0) - 1, (y * y).sum(0) - 1, (x * y).sum(0), *cross_error]
     has_last_row = (m[3, 3] == 1) & ~m[3, :3].any(0)  # 0, 0, 0, 1
-    valid = np.isfinite(shift.sum(0)) & has_last_row
+    valid = np.isfinite(shift.sum(0)) & has_last_row  # a sum is finite only if all terms are
     for error in errors:
-        valid &= np.abs(error) < tolerance
+        valid &= np.abs(error) < tolerance  # False for NaN
     return valid

@@ -14,6 +14,7 @@ CLASS_COLOURS = {
     "boundary": "#1DB954",
     "centerline": "#8E8E93",
 }
+# Titles of classes whose names are not plain words. Other classes use their names.
 CLASS_TITLES = {
     "ped_crossing": "pedestrian crossing",
     "boundary": "road boundary",
@@ -22,6 +23,7 @@ CLASS_TITLES = {
 _GREY = "#8E8E93"
 # Colours of matches: a prediction is a hit or false, a ground truth is found or missed.
 MATCH_COLOURS = {"hit": "#00A39A", "false": "#FF3B30", "found": _GREY, "missed": "#AF52DE"}
+# Opacity of ground truths: found ones are fainter than missed ones.
 TRUTH_OPACITY = {"found": 0.4, "missed": 0.75}
 FALSE_DASHES = (0, (3, 1.5))  # line style of matplotlib: offset, and lengths of dash and gap
 # Colours of runs and methods in plots, distinct from the colours of classes and matches.
@@ -54,9 +56,9 @@ def track_colours(tracks: Iterable[int]) -> list[str]:
         if track < 0:
             colours.append(_GREY)
             continue
-        hue = (track * _HUE_STEP) % 1
+        hue = (track * _HUE_STEP) % 1  # a fraction of the colour circle
         value = _TRACK_VALUES[(track // _TRACKS_PER_VALUE) % len(_TRACK_VALUES)]
-        colours.append(to_hex(hsv_to_rgb(hue, 0.85, value)))
+        colours.append(to_hex(hsv_to_rgb(hue, 0.85, value)))  # hue, saturation 0.85, value
     return colours
 
 
@@ -96,7 +98,7 @@ class MapStyle:
         return [self.colour(label) for label in labels]
 
     def title(self, label: int) -> str:
-        """Class name in plain words."""
+        """Class name in plain words, for legends and titles."""
         name = self.classes[label]
         return CLASS_TITLES.get(name, name.replace("_", " "))
 

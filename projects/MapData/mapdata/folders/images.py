@@ -38,7 +38,7 @@ from mapdata.paths import path_below
 from mapdata.unix_times import span_of
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
-_RATE_HZ = 10.0  # rate of the images if a calibration file has no rate_hz
+_RATE_HZ = 10.0  # assumed rate of the images if a calibration file has no rate_hz
 # Largest number of ``**`` in a pattern. Each multiplies the time of the search by the depth of the
 # folders.
 _MOST_ANY = 2
@@ -61,12 +61,15 @@ def read_image_folder(
         The samples, with notes on assumptions and omissions.
 
     Raises:
-        FileNotFoundError: If a camera has no image, or the file names poses that do not exist.
+        FileNotFoundError: If a camera has no image, or the file names a file of poses that does not
+            exist.
         ValueError: If the file is malformed; the message names the camera.
     """
     folder = file.parent
     with explain_errors(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
+        # Pose of the road in the vehicle's frame. Cameras and poses are given for the vehicle, and
+        # are converted to the road below it.
         ground = ground_pose(content)
         rig = []
         images = {}
@@ -84,7 +87,9 @@ def read_image_folder(
         notes += frame_notes
         notes += _usage_notes(frames, images=images, tolerance_ns=tolerance_ns)
         poses = read_named_poses(content, folder=folder, time_of=time_of, ground=ground)
-        pose_at = None if poses is None else cache(poses.at)  # images of one time share a pose
+        # `pose_at` returns the pose at a time, or None if no pose is near. Images of one time share
+        # the cached result.
+        pose_at = None if poses is None else cache(poses.at)
         if poses is not None and pose_at is not None:
             frames, pose_notes = _frames_with_poses(frames, poses=poses, pose_at=pose_at)
             notes += pose_notes
@@ -92,7 +97,7 @@ def read_image_folder(
         target_key = set_rectification_targets(rig, trained or {})
         scene = folder.resolve().name
         samples = rig_samples(scene, rig, frames=frames, pose_at=pose_at)
-        root = folder
+        root = folder  # folder of the image paths
         if any(camera.is_distorted for camera in rig):
             digest = _digest(file, frames=frames, target_key=target_key)
             root = frames_dir / f"{file_name(scene)}-{digest}"
@@ -124,6 +129,8 @@ def _read_timing(content: Mapping[str, Any]) -> tuple[float | None, int]:
 def _digest(file: Path, frames: Sequence[RigFrame], target_key: bytes) -> str:
     """Digest of a calibration file, of the images of frames and of ``target_key``.
 
+    If one of them changes, images are rectified again, into another folder.
+
     ``target_key`` is the result of `set_rectification_targets`. It depends on the cameras to which
     images are rectified.
     """
@@ -144,9 +151,15 @@ def _find_images(
 
     Returns:
         The images, and a note if there are files of other types.
+
+    Raises:
+        FileNotFoundError: If there is no image.
+        ValueError: If two images have equal names, or the pattern is not allowed.
     """
     pattern = str(camera.get("images", name))
+    # A path that leads out of the folder is an error.
     place = path_below(folder, pattern, noun="images")
+    # The pattern of a single file is its name.
     candidates = place.iterdir() if place.is_dir() else folder.glob(_simplify_pattern(pattern))
     images = []
     other_suffixes = set()
@@ -167,6 +180,7 @@ def _find_images(
             "pattern, from the calibration file's folder (by default the camera's name)."
             f"{hint if suffixes else ''}"
         )
+    # Names without suffix identify the images of one time in all cameras.
     if len({path.stem for path in images}) < len(images):
         raise InputError(
             f"two of its images at {place} have equal names (apart from folder and suffix): rename "
@@ -184,7 +198,7 @@ def _simplify_pattern(pattern: str) -> str:
     """Reduce successive ``**`` of a pattern to one; more than `_MOST_ANY` in all are an error."""
     parts: list[str] = []
     for part in Path(pattern).parts:
-        is_repeat = part == "**" and parts[-1:] == ["**"]
+        is_repeat = part == "**" and parts[-1:] == ["**"]  # the slice may be empty
         if not is_repeat:
             parts.append(part)
     if parts.count("**") > _MOST_ANY:
@@ -199,14 +213,21 @@ def _group_images(
 
     If every camera has a single image without a time, these images form one frame.
 
+    Args:
+        images: Images of each camera, in natural order of their names.
+        rate_hz: Rate of the images, if the file has one.
+        tolerance_ns: Largest difference of times in one frame, in nanoseconds.
+        folder: Folder of the calibration file, to which the paths of the frames are relative.
+
     Returns:
-        The frames, the time of each file name that has one, and notes on assumptions.
+        The frames, the time in nanoseconds of each file name without suffix that has one, and notes
+        on assumptions.
     """
     scene = folder.resolve().name
     stems: set[str] = set()
     for paths in images.values():
         stems.update(path.stem for path in paths)
-    time_of = times_of_names(stems)
+    time_of = times_of_names(stems)  # in nanoseconds; None unless all names have a Unix time
     if time_of is not None:
         return _group_by_times(
             images, rate_hz, tolerance_ns=tolerance_ns, time_of=time_of, folder=folder
@@ -253,7 +274,10 @@ def _group_by_times(
     time_of: dict[str, int],
     folder: Path,
 ) -> tuple[list[RigFrame], dict[str, int], list[str]]:
-    """Group the images of all cameras around the times of the first camera."""
+    """Group the images of all cameras around the times of the first camera.
+
+    ``time_of`` has the time of each file name. Other arguments and results: see `_group_images`.
+    """
     scene = folder.resolve().name
     path_at: dict[str, dict[int, str]] = {}  # path of the image of a camera at a time
     times_ns = {}
@@ -263,6 +287,7 @@ def _group_by_times(
     frame_times = next(iter(times_ns.values())).tolist()
     _check_rate(frame_times, rate_hz=rate_hz)
     frames = []
+    # For each frame, the time of the nearest image of each camera with an image in the tolerance.
     nearest = nearest_images(times_ns, frame_times, tolerance_ns=tolerance_ns)
     for frame_ns, image_times in zip(frame_times, nearest, strict=True):
         frame_images = {}
@@ -277,6 +302,7 @@ def _check_rate(times_ns: Sequence[int], rate_hz: float | None) -> None:
     """Raise a ``ValueError`` if the rate contradicts the times in the names of the images."""
     if rate_hz is None or len(times_ns) < 2:
         return
+    # A factor of 2 in either direction is allowed, since images may be missing.
     step_s = float(np.median(np.diff(times_ns))) / 1e9
     if not 0.5 < step_s * rate_hz < 2:
         raise InputError(
@@ -337,7 +363,14 @@ def _rectify_images(
 ) -> list[str]:
     """Rectify the images of a sample, write them, and set the paths of its cameras to them.
 
-    Images that cannot be read are not written, so that reading the sample fails.
+    Images that cannot be read are not written, so that reading the sample fails. Images that an
+    earlier call has written are kept.
+
+    Args:
+        sample: The sample, whose camera records are changed in place.
+        rig: Cameras of the vehicle.
+        root: Folder of the paths of the given images.
+        target: Folder of the rectified images.
 
     Returns:
         Notes on the images that cannot be read.
@@ -347,6 +380,7 @@ def _rectify_images(
     for record in sample.cameras:
         camera = camera_of[record.name]
         source = root / record.path
+        # Names come from the user. `file_name` makes them safe for the file system.
         suffix = "" if source.suffix.lower() == ".jpg" else ".jpg"  # all are written as JPEG
         record.path = f"{file_name(record.name)}/{file_name(source.name)}{suffix}"
         if (target / record.path).is_file():

@@ -1,4 +1,8 @@
-"""Conversion of nuScenes-format data (nuScenes, MiniCity) to annotation files."""
+"""Conversion of nuScenes-format data (nuScenes, MiniCity) to annotation files.
+
+A split list divides scenes into parts such as ``train`` and ``val``. An annotation file has the
+samples of one part. Where one file is meant, its part is called the split.
+"""
 
 import argparse
 from collections import defaultdict
@@ -50,11 +54,14 @@ from mapdata.splits import (
 )
 from mapdata.summary import ConversionSummary
 
+# Parts of nuScenes' official split list, by version.
 _OFFICIAL_SPLITS = {
     "v1.0-trainval": ("train", "val"), "v1.0-mini": ("mini_train", "mini_val"),
     "v1.0-test": ("test",),
 }  # fmt: skip
-_FRAMES_PER_WORKER = 500  # converting them takes about as long as starting a process
+# Smallest number of frames for which a worker is started. Their conversion takes about as long as
+# the start of a process.
+_FRAMES_PER_WORKER = 500
 _Scene = tuple[dict[str, Any], NuScenesTables]  # record of a scene, and the tables of its version
 
 
@@ -114,6 +121,7 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
     """
     from nuscenes.utils.splits import create_splits_scenes
 
+    # The list that an option names, or None: a published list by its name, or the list in a file.
     published_or_file = requested_split(options, "nuscenes")
     if published_or_file is not None:
         return published_or_file, published_or_file.identity
@@ -143,8 +151,12 @@ def _resolve_splits(
 
     Returns:
         Part by name of the scene, and a note if scenes of the list are missing in the data set.
+
+    Raises:
+        ValueError: If a scene is in several parts, if no scene of the list is in the data set, or
+            if a scene is missing and must not be.
     """
-    names = {}
+    names = {}  # names of the scenes by token: a list may give either
     for scene, _ in scenes:
         names[scene["token"]] = scene["name"]
     where = " and ".join(str(options.root / version) for version in options.versions)
@@ -183,7 +195,7 @@ def _extract_instances(
 
 
 def _map_names(scene_of_version: _Scene) -> tuple[str, str]:
-    """Location of a scene, and name of its map file."""
+    """Location of a scene, and name of its map file, which may be an earlier map of the place."""
     scene, tables = scene_of_version
     return tables.location_of(scene), tables.expansion_of(scene)
 
@@ -232,11 +244,13 @@ class _Conversion:
         for scene, tables in self.scenes:
             if scene["name"] in self.split_of:
                 selected.append((scene, tables))
+        # `shard.part` takes the scenes that this process converts; without shards, all.
+        # They are sorted since `groupby` below joins only neighbours.
         scenes = self.options.shard.part(sorted(selected, key=_map_names))
         progress = Progress(
             desc=f"{self.options.dataset} {'+'.join(self.options.versions)}",
             unit="samples",
-            smoothing=0.05,
+            smoothing=0.05,  # small, so that the speed is averaged over many samples
             total=_count_samples(scenes),
         )
         with progress as bar:
@@ -250,6 +264,7 @@ class _Conversion:
                     split = self.split_of[sample.scene]
                     writers[split].write(sample)
                     self.summary.add_sample(split, sample)
+                    # Positions are compared at the end: training and validation may overlap.
                     position = sample.global_from_frame[:2, 3]
                     self.positions[split][sample.map_name].append(position)
 
@@ -273,6 +288,7 @@ class _Conversion:
             y_range=options.y_range,
             crossings=options.crossings,
         )
+        # With one worker, the elements are extracted in this process.
         useful_workers = _count_samples(scenes) // _FRAMES_PER_WORKER
         workers = max(1, min(options.workers, len(scenes), useful_workers))
         # Each scene is read once. Its samples are used twice: the workers take their poses, and the
@@ -281,6 +297,7 @@ class _Conversion:
         samples, samples_for_workers = tee(map(self._scene_samples, scenes))
         poses = map(_stack_poses, samples_for_workers)
         results = ordered_map(partial(_extract_instances, local_map), poses, workers=workers)
+        # Results are in the order of the scenes, one entry per sample.
         for scene_samples, instances in zip(samples, results, strict=True):
             yield from zip(scene_samples, instances, strict=True)
 
@@ -292,6 +309,7 @@ class _Conversion:
         if expected_cameras.intersection(CAMERAS):  # a rig with cameras of nuScenes has all six
             expected_cameras.update(CAMERAS)
         for record in tables.samples_of(scene):
+            # `data` of a record has the key frames of the sample by the name of the sensor.
             token = record["token"]
             if tables.lidar not in record["data"]:  # the pose of the sample is unknown
                 self.summary.add_problem(f"sample left out: no {tables.lidar} key frame", token)
@@ -325,32 +343,32 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         Counts of the samples and map elements in the files, and of the problems.
 
     Raises:
-        FileNotFoundError: If the data set, its version or a map is missing.
-        ValueError: If splits or classes do not fit the data set.
+        FileNotFoundError: If the data set, its version, a table or a map is missing.
+        ValueError: If splits or classes do not fit the data set, or a table or a map is damaged.
     """
     check_classes(options.classes)
     for version_name in options.versions:
         _check_root(options.root, version_name)
     conversion = _Conversion(options)
     source_fingerprint = _source_fingerprint(options)
-    versions = {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")}
-    choices: dict[str, Any] = {
+    package_versions = {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")}
+    choices: dict[str, Any] = {  # options that are recorded in the files
         "version": "+".join(options.versions),
         "max_sweeps": options.max_sweeps,
     }
-    if options.crossings != UNITED:
+    if options.crossings != UNITED:  # the default is not recorded
         choices["crossings"] = options.crossings
     if conversion.identity:
         choices[SPLIT_LIST] = conversion.identity
     with ExitStack() as stack:
         writers = {}
-        for split in conversion.positions:
+        for split in conversion.positions:  # splits with scenes in the data set
             meta = options.meta(
                 options.dataset,
                 options.frame,
                 split,
                 source_fingerprint=source_fingerprint,
-                versions=versions,
+                versions=package_versions,
                 options=choices,
             )
             target = options.path_of(options.dataset, split)
@@ -369,13 +387,18 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         notes.append(f"cameras {names}: name them in `cameras` of a config's data sets.")
     if not (options.root / "can_bus").is_dir():
         notes.append("no CAN bus expansion: acceleration, rotation rate and velocity are 0.")
-    if not options.shard.count:  # a shard has only a part of the positions
+    # A warning if validation samples are near training samples. A shard has only a part of the
+    # positions, and its `count` is not 0.
+    if not options.shard.count:
         notes += overlap_notes(conversion.positions)
     return conversion.summary
 
 
 def _source_fingerprint(options: NuScenesOptions) -> str:
-    """Digest of the sizes of all tables and the content of the scene tables and maps."""
+    """Digest of the sizes of all tables and the content of the scene tables and maps.
+
+    The content of the other tables, some of which are large, is not read.
+    """
     sizes = {}
     contents = []
     for version_name in options.versions:

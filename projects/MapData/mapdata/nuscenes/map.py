@@ -39,8 +39,8 @@ from mapdata.local_map import (
 if TYPE_CHECKING:
     from nuscenes.map_expansion.map_api import NuScenesMap
 
-LINE_LAYERS = ("road_divider", "lane_divider")
-SURFACE_LAYERS = ("road_segment", "lane")
+LINE_LAYERS = ("road_divider", "lane_divider")  # layers of the map that make dividers
+SURFACE_LAYERS = ("road_segment", "lane")  # layers whose union has the boundaries as outlines
 # The slice of AREA_CLASSES is stop_line, intersection and carpark_area.
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:4], "centerline")
 CROSSING = "ped_crossing"
@@ -54,10 +54,11 @@ class MapLayers:
 
     Args:
         lines: Dividers.
-        polygons: Valid polygons by layer or class. Each (n,).
+        polygons: Valid polygons, by the name of a surface layer or of an area class. Each (n,).
         skipped: Number of unusable elements, by reason.
         centerlines: Vertices of the centre lines of lanes and lane connectors. Each (n, 3).
-        links: For each centre line, its pairs of predecessor and successor (`link_lanes`).
+        links: For each centre line, its pairs of predecessor and successor, as indices into
+            ``centerlines`` (`link_lanes`).
     """
 
     lines: list[shapely.LineString]
@@ -80,7 +81,10 @@ def _read_lines(
 
 
 def _read_polygons(nusc_map: "NuScenesMap", name: str, skipped: Counter[str]) -> np.ndarray:
-    """Polygons of a layer or class; invalid polygons are counted in ``skipped``. (n,)"""
+    """Polygons of a layer or class; invalid polygons are counted in ``skipped``. (n,)
+
+    The class ``intersection`` has no layer. It consists of the road segments that are marked so.
+    """
     layer = "road_segment" if name == "intersection" else name
     polygons = []
     for record in getattr(nusc_map, layer):
@@ -116,6 +120,9 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
         name: Name of the map, such as ``boston-seaport``.
         classes: Classes of the ground truth, out of ``MAP_CLASSES``.
 
+    Returns:
+        The geometries that the classes need, and the counts of omissions.
+
     Raises:
         FileNotFoundError: If the map is missing.
         ValueError: If the map is damaged, or its name cannot be the name of a file.
@@ -134,6 +141,7 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
     area_names = set(AREA_CLASSES) & set(classes)
     if "boundary" in classes:
         area_names |= set(SURFACE_LAYERS)
+    # Errors about the content get the name of the file and this advice.
     with explain_errors(path, "unpack the map expansion pack (v1.3) again"):
         nusc_map = _open_map(root, name)
         polygons = {}
@@ -180,16 +188,19 @@ def _read_centerlines(nusc_map: "NuScenesMap", layers: MapLayers) -> None:
     lanes = []
     for record in (*nusc_map.lane, *nusc_map.lane_connector):
         token = record["token"]
+        # The devkit returns the poses (x, y, yaw) of points on the centre line, by token.
         poses = nusc_map.discretize_lanes([token], CENTERLINE_STEP_M)[token]
         if len(poses) < 2:
             layers.skipped["lane without a centre line"] += 1
             continue
         points = np.array(poses)[:, :2]
         layers.centerlines.append(np.pad(points, ((0, 0), (0, 1))))  # height 0
+        # Tokens of the lanes and lane connectors that lead into this one, and out of it.
         connections = nusc_map.connectivity.get(token, {})
         incoming = connections.get("incoming", [])
         outgoing = connections.get("outgoing", [])
         lanes.append((token, incoming, outgoing))
+    # Lanes without a centre line are not in `lanes`, so `link_lanes` ignores links to them.
     layers.links = link_lanes(lanes)
 
 
@@ -231,6 +242,7 @@ class NuScenesLocalMap:
         self._crossings = crossings
         self.x_range = x_range
         self.y_range = y_range
+        # A `GeometryLayer` finds the geometries near a patch by a spatial index.
         self._lines = GeometryLayer(layers.lines)
         areas = set(AREA_CLASSES) & set(classes)
         self._areas = {name: GeometryLayer(layers.polygons[name]) for name in areas}
@@ -239,8 +251,11 @@ class NuScenesLocalMap:
             if name in layers.polygons:
                 surfaces.append(shapely.union_all(layers.polygons[name]))
         surface_parts = shapely.get_parts(shapely.union_all(surfaces))
+        # Rings of exteriors and holes, cut into short chunks for a fast search.
         self._outlines = OutlineIndex(rings_of(surface_parts))
         self._lane_paths = LanePaths(layers.centerlines, layers.links)
+        # The tree finds the lanes near a patch, and the paths lead through these lanes. Both use
+        # the indices of the centre lines.
         lanes = [shapely.LineString(line[:, :2]) for line in layers.centerlines]
         self._lane_tree = shapely.STRtree(lanes)
 
@@ -269,11 +284,13 @@ class NuScenesLocalMap:
         if name in self._areas:
             pieces = shapely.intersection(self._areas[name].near(patch), patch.polygon)
             parts = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
+            # Areas that only touch the patch leave points and lines, which are dropped.
             polygons = parts[shapely.get_type_id(parts) == POLYGON]
             return vertices_of(rings_of(polygons), dim=2)
         if name == "divider":
             lines = self._lines.near(patch)
         else:  # "centerline"
+            # A tree returns indices in any order. They are sorted for a fixed order of the paths.
             near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
             lines = shapely.force_2d(self._lane_paths.simplify_paths(near.tolist()))
         return vertices_of(patch.to_local(patch.lines_inside(lines)), dim=2)
@@ -282,10 +299,11 @@ class NuScenesLocalMap:
         """Vertices of crossings by the rule ``edges`` or ``parallel``. Each (n, 2)."""
         near = self._areas[CROSSING].near(patch)
         if self._crossings == EDGES:
+            # The edges are chosen before they are cut at the patch.
             lines = patch.lines_inside(long_edges(near))
             return vertices_of(patch.to_local(lines), dim=2)
         clipped = shapely.intersection(near, patch.polygon)
-        # `owner` is the index of the crossing of each piece.
+        # `owner` is the index of the crossing of each piece. A crossing may be cut into several.
         pieces, owner = shapely.get_parts(clipped, return_index=True)
         is_polygon = shapely.get_type_id(pieces) == POLYGON
         polygons = patch.to_local(pieces[is_polygon])

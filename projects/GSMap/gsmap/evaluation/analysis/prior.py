@@ -1,7 +1,7 @@
-"""Baseline that predicts one constant map in every sample, fitted on a training set.
+"""Baseline that predicts one constant map, the prior, in every sample, fitted on a training set.
 
 A network that uses its images must be better than this baseline. The elements and their scores are
-constant; they are chosen greedily for AP_chamfer on the training set.
+constant; they are chosen greedily for AP_chamfer on the training set. A frame is a training sample.
 """
 
 import math
@@ -41,7 +41,7 @@ def _aligned_mean(line: FloatArray, others: FloatArray) -> FloatArray:
     Returns:
         Mean line in metres. (P, 2)
     """
-    orders = [others, others[:, ::-1]]
+    orders = [others, others[:, ::-1]]  # S orders of the points, each of all lines
     if np.allclose(line[0], line[-1]) and np.allclose(others[:, 0], others[:, -1]):
         ring = others[:, :-1]  # without the last point, which repeats the first one
         for shift in range(1, ring.shape[1]):
@@ -49,7 +49,7 @@ def _aligned_mean(line: FloatArray, others: FloatArray) -> FloatArray:
             closed = np.concatenate([rolled, rolled[:, :1]], axis=1)
             orders += [closed, closed[:, ::-1]]
     stacked = np.stack(orders)  # (S, K, P, 2)
-    gaps = np.square(stacked - line).sum(axis=(2, 3))
+    gaps = np.square(stacked - line).sum(axis=(2, 3))  # (S, K)
     nearest_order = gaps.argmin(axis=0)
     mean: FloatArray = stacked[nearest_order, np.arange(len(others))].mean(axis=0)
     return mean
@@ -70,6 +70,7 @@ class _ClassFit:
         self.num_samples = len(truth)
         self.thresholds = np.asarray(chamfer.thresholds)
         self.frames: list[MapElements] = []  # samples with ground truth of the class
+        # The empty first array gives the result its shape if no sample has ground truth.
         lines = [np.empty((0, _NUM_POINTS, chamfer.dim))]
         for elements in truth:
             frame = elements.with_coordinates(chamfer.dim)
@@ -78,10 +79,13 @@ class _ClassFit:
                 self.frames.append(frame)
                 lines.append(resample_all(frame.points, frame.offsets, num_points=_NUM_POINTS))
         # Index of the first ground truth of each frame. The last entry is the number K of ground
-        # truths in all frames. (F + 1,)
+        # truths in all F frames. (F + 1,)
         self.first = np.cumsum([0, *map(len, self.frames)])
         self.points = np.concatenate(lines)  # ground truths of all frames, (K, P, 2 or 3)
+        # Whether an element of the prior has matched a ground truth, at each of the T thresholds.
         self.is_taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)  # (T, K)
+        # Candidates for elements are ground truths, drawn at random with a fixed seed. Their order
+        # in the data is kept.
         order = np.random.default_rng(0).permutation(len(self.points))
         self.candidates = self.points[np.sort(order[:_MAX_CANDIDATES])]
         self.nearest, self.distance = self._compare(self.candidates)
@@ -93,14 +97,16 @@ class _ClassFit:
             lines: Points in metres. (N, P, 2 or 3)
 
         Returns:
-            Two arrays: index of the ground truth, or -1, and its Chamfer distance in metres,
-            infinite without one. (N, F) each
+            Two arrays: index of the ground truth in ``self.points``, or -1 if no ground truth is
+            within the largest threshold, and its Chamfer distance in metres, or infinity. (N, F)
+            each
         """
         labels = np.full(len(lines), fill_value=self.label)
         elements = MapElements.from_polylines(lines, labels=labels)
         nearest = np.full((len(lines), len(self.frames)), fill_value=-1)
         distance = np.full(nearest.shape, fill_value=np.inf)
         for i, frame in enumerate(self.frames):
+            # `in_frame` has indices into the ground truths of the frame, or -1.
             in_frame, distance[:, i] = nearest_by_chamfer(
                 elements, frame, config=self.chamfer, max_distance=self.thresholds[-1]
             )
@@ -126,7 +132,11 @@ class _ClassFit:
         return np.asarray(np.mean(hits, axis=0))
 
     def propose(self) -> tuple[float, float, int]:
-        """Return the gain in AP of the best candidate, its precision and its index."""
+        """Return the gain in AP of the best candidate, its precision and its index.
+
+        The precision is the share of samples in which the candidate has a new match. Without
+        candidates, the index is -1, and the gain and the precision are 0.
+        """
         if not len(self.candidates):
             return 0.0, 0.0, -1
         hits = self._new_hits(self.nearest, self.distance)
@@ -140,23 +150,25 @@ class _ClassFit:
         """Refine a candidate and mark its matches as taken.
 
         Args:
-            index: Index of the candidate.
+            index: Index of the candidate, from `propose`.
 
         Returns:
-            Refined line in metres (P, 2 or 3), and its precision.
+            Refined line in metres (P, 2 or 3), and its precision: the share of samples in which it
+            has a new match.
         """
         line = self.candidates[index]
         nearest = self.nearest[index]
         distance = self.distance[index]
         num_hits = float(self._new_hits(nearest, distance))
         for _ in range(_REFINEMENTS):
+            # New matches at the largest threshold. The thresholds are in ascending order.
             is_new = (distance <= self.thresholds[-1]) & ~self.is_taken[-1][nearest]
             if not is_new.any():
                 break
             refined = _aligned_mean(line, self.points[nearest[is_new]])
             all_nearest, all_distances = self._compare(refined[None])
             refined_hits = float(self._new_hits(all_nearest[0], all_distances[0]))
-            if refined_hits <= num_hits:
+            if refined_hits <= num_hits:  # the mean is no better than the line before
                 break
             line = refined
             num_hits = refined_hits
@@ -184,6 +196,9 @@ def fit_prior(
         max_elements: Largest number of elements of all classes; a network with 50 queries
             predicts 50.
 
+    Returns:
+        The elements with scores, in the order in which they were chosen.
+
     Raises:
         ValueError: If the training set contains no ground truth.
     """
@@ -197,6 +212,7 @@ def fit_prior(
         proposals = [fit.propose() for fit in fits]
         gains = [gain for gain, _, _ in proposals]
         label = int(np.argmax(gains))
+        # Gains of different classes are comparable, since mAP is the mean over the classes.
         _, precision, index = proposals[label]
         if precision < _MIN_PRECISION:
             break
@@ -233,10 +249,12 @@ def evaluate_prior(
     """
     if not allow_other_split:
         _check_splits(train_path, truth_path)
+    # The prior is fitted for AP_chamfer of the evaluator, or else with default rules.
     chamfer = ChamferConfig(evaluator.classes)
     for metric in evaluator.metrics:
         if metric.name == "chamfer" and isinstance(metric, ChamferConfig):
             chamfer = metric
+    # Elements by token. The second result counts elements of other classes, which are ignored.
     all_train, _ = read_ground_truth(train_path, evaluator.classes)
     step = max(1, math.ceil(len(all_train) / _MAX_TRAINING_SAMPLES))
     train_items = list(all_train.items())[::step]
@@ -245,6 +263,7 @@ def evaluate_prior(
     prior = fit_prior(list(train.values()), chamfer=chamfer, max_elements=max_elements)
 
     chamfer_evaluator = MapEvaluator(chamfer)
+    # The evaluator has one metric, so there is one report.
     train_report = _evaluate_constant(prior, truth=train, evaluator=chamfer_evaluator)[0]
     note = (
         f"the same {len(prior)} elements in every sample, fitted on {len(train)} training "
@@ -264,7 +283,11 @@ def _evaluate_constant(
 
 
 def _check_splits(train_path: str | Path, truth_path: str | Path) -> None:
-    """Raise ValueError if two annotation files belong to different splits of a data set."""
+    """Raise ValueError if two annotation files belong to different splits of a data set.
+
+    A split is a division of the data set into parts such as ``train`` and ``val``. Parts of
+    different splits may share places.
+    """
     for path in (train_path, truth_path):
         if Path(path).suffix.lower() == ".json":  # a JSON file has no split
             return

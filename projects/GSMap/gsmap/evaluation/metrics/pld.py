@@ -28,10 +28,10 @@ from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
-_STEP_M = 0.5  # distance of neighbouring points
+_STEP_M = 0.5  # distance between neighbouring points of a sampled line
 _MOST_STEPS = 2000  # largest number of steps of a line; the time grows with its square
 _CLOSED_M = 0.1  # largest gap between the ends of a ring
-_PARTS = ("PLD", "localisation", "cardinality")
+_PARTS = ("PLD", "localisation", "cardinality")  # PLD is the sum of the other two
 
 
 def sample_line(line: FloatArray) -> FloatArray:
@@ -52,6 +52,7 @@ def sample_line(line: FloatArray) -> FloatArray:
     step_m = max(_STEP_M, length_m / _MOST_STEPS)
     stop = max(length_m, np.finfo(float).tiny)  # > 0, so that a line of length 0 keeps its start
     positions = np.append(np.arange(0.0, stop, step=step_m), length_m)
+    # The columns are x, y and, in 3-D, z.
     return np.stack([np.interp(positions, along, column) for column in line.T], axis=-1)
 
 
@@ -99,11 +100,16 @@ def _align_lines(distances: FloatArray, gap_cost: float, num_starts: int) -> tup
     Args:
         distances: Distance of every pair of points in metres. (m, n)
         gap_cost: Cost of a point without partner, in metres.
-        num_starts: Number of points at which the first line may start.
+        num_starts: Number of points at which the first line may start: all points of a ring, and 1
+            for an open line.
+
+    Returns:
+        Smallest total cost, and the part of it that is the sum of the distances of the pairs.
     """
     best_cost = np.inf
     best_paired = 0.0
     for start in range(num_starts):
+        # numba does not support `np.roll` with an axis.
         rolled = np.concatenate((distances[start:], distances[:start]))
         for direction in (1, -1):
             cost, paired = _align_points(rolled[::direction], gap_cost=gap_cost)
@@ -129,7 +135,7 @@ def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> 
         cutoffs_m: Cut-offs c in metres, > 0. (T,)
 
     Returns:
-        Distance and localisation part at each cut-off. (T, 2)
+        Distance and localisation part at each cut-off; 1 and 0 if a line has no points. (T, 2)
     """
     first_is_closed = _is_closed(first)
     second_is_closed = _is_closed(second)
@@ -143,6 +149,7 @@ def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> 
     distances = cdist(first, second)
     num_starts = len(first) if first_is_closed or second_is_closed else 1
     for row, cutoff in enumerate(cutoffs_m):
+        # Points at the cut-off or beyond cost no less as a pair than without partners.
         if distances.min() < cutoff:
             gap_cost = cutoff / 2
             sums = np.array(_align_lines(distances, gap_cost, num_starts))  # C, distances of pairs
@@ -184,6 +191,7 @@ def _pair_sums(
     for row in range(len(cutoffs_m)):
         gains = scores[:, None] * (1 - distances[:, :, row, 0])
         errors = scores[:, None] * distances[:, :, row, 1]
+        # The best pairs have the largest sum of gains. `pairs` has their rows and their columns.
         pairs = linear_sum_assignment(gains, maximize=True)
         sums[row, 0] = gains[pairs].sum()
         sums[row, 1] = errors[pairs].sum()
@@ -232,10 +240,15 @@ class PLD(Metric):
 
         Predictions of fewer than two points are left out. Ground truths of fewer than two points
         have no partner.
+
+        Returns:
+            ``sums`` (classes, T, 2): the two results of `_pair_sums` at each cut-off. ``masses``
+            (classes, 1): the sum of the costs without any pair, M in the description of the class.
         """
         token, predictions, truth = sample
         check_pair(predictions, truth, classes=self.classes, token=token)
         predictions = predictions.select(predictions.num_points >= 2)
+        # Only the plane counts, so heights are cut off.
         pred_lines = [sample_line(line[:, :2]) for line in predictions.polylines]
         gt_lines = [sample_line(line[:, :2]) for line in truth.polylines]
         sums = np.zeros((len(self.classes), len(self.cutoffs_m), 2))
@@ -269,7 +282,7 @@ class PLD(Metric):
         sums = np.sum(table.column("sums"), axis=0)
         masses = np.sum(table.column("masses"), axis=0)
         gains = sums[..., 0]
-        errors = sums[..., 1]
+        errors = sums[..., 1]  # distances of the pairs, as parts of SOSPA times the scores
         # D = M - gains, so M + D = 2 M - gains.
         denominator = np.maximum(2 * masses - gains, np.finfo(float).tiny)
         pld = 2 * (masses - gains) / denominator

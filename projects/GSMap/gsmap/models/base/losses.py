@@ -15,13 +15,16 @@ from gsmap.utils.targets import NeedsTargets
 class MapLoss(nn.Module, NeedsTargets):
     """Loss of matched pairs: the weighted sum of `values`, divided by ``pairs.avg_factor``.
 
+    A pair is a prediction and its ground truth. ``avg_factor`` is the number of pairs of one layer,
+    averaged over the processes of a training, and at least 1.
+
     A subclass overrides one of three methods. A loss that is a sum over pairs overrides `values`;
     the pairs of all decoder layers are then processed at once. Any other loss overrides `forward`,
     which computes one layer, or `by_layer`, which computes all layers at once.
 
     Args:
-        loss_weight: Weight of the loss, or a weight for each class, applied to the pairs of the
-            class.
+        loss_weight: Weight of the loss, or a weight for each class, applied to the pairs whose
+            ground truth is of the class.
         last_layer_only: Compute the loss for the last decoder layer only.
         first_group_only: Compute the loss for the first query group only, the only group that is
             used in prediction.
@@ -47,6 +50,7 @@ class MapLoss(nn.Module, NeedsTargets):
     ) -> None:
         super().__init__()
         kind = type(self)
+        # A loss is a sum over pairs if its class overrides neither of these methods.
         is_sum = kind.forward is MapLoss.forward and kind.by_layer is MapLoss.by_layer
         if isinstance(loss_weight, Sequence) and not is_sum:
             raise InputTypeError(f"{kind.__name__} is no sum over pairs: give one loss_weight.")
@@ -71,6 +75,9 @@ class MapLoss(nn.Module, NeedsTargets):
 
         Args:
             pairs: Pairs of the layer.
+
+        Returns:
+            False to skip the loss for the layer. By default, the loss is never skipped.
         """
         return True
 
@@ -104,6 +111,7 @@ class MapLoss(nn.Module, NeedsTargets):
             # The axis of the pairs is moved to the end, so that the weights (M,) are broadcast, and
             # then back to the front.
             values = (weights * values.movedim(0, -1)).movedim(-1, 0)
-        layer_values = pairs.by_layer(values)  # (L, M / L, ...)
+        layer_values = pairs.by_layer(values)  # split by layer, (L, M / L, ...)
         sums = layer_values.flatten(1).sum(1) / pairs.avg_factor
+        # Class weights have been applied to the values above.
         return sums if has_class_weights else self.loss_weight * sums

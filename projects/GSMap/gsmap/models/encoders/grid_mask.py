@@ -12,9 +12,13 @@ from gsmap.utils.errors import InputError
 class GridMask(nn.Module):
     """GridMask augmentation (arXiv 2001.04086): a regular grid of black squares in all images.
 
+    Masked pixels are set to 0. All images of a batch get one mask. The detector calls this
+    module in training only.
+
     Args:
         prob: Probability of masking a batch, in [0, 1].
-        ratio: Width of a visible stripe as a share of the period of the grid, in (0, 1).
+        ratio: Width of a visible stripe as a share of the period of the grid, in (0, 1). The period
+            is the distance from one square to the next; it is drawn at random for each mask.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -28,9 +32,10 @@ class GridMask(nn.Module):
         self.ratio = ratio
 
     def forward(self, images: Tensor) -> Tensor:
-        """Mask the images with probability ``prob``. (V, 3, H, W) -> (V, 3, H, W)"""
+        """Mask all images of a batch with probability ``prob``. (V, 3, H, W) -> (V, 3, H, W)"""
         if torch.rand(()) >= self.prob:
             return images
+        # `upload` copies a list of tensors to the device of the images without waiting for it.
         (mask,) = upload([self.draw_mask(*images.shape[-2:])], images.device)
         return images * mask.to(images.dtype)
 
@@ -38,13 +43,14 @@ class GridMask(nn.Module):
         """Random mask: 0 in the squares, 1 elsewhere. (H, W)
 
         Args:
-            height: Rows of the images.
+            height: Rows of the images, at least 3.
             width: Columns of the images.
         """
         period = int(torch.randint(2, height, ()))
-        side = min(max(round(period * self.ratio), 1), period - 1)
-        row, col = torch.randint(period, (2,)).tolist()
-        row_is_visible = (torch.arange(height) + row) % period < side
-        column_is_visible = (torch.arange(width) + col) % period < side
+        # At least one pixel of a period is visible, and at least one is masked.
+        visible_px = min(max(round(period * self.ratio), 1), period - 1)
+        row_shift, column_shift = torch.randint(period, (2,)).tolist()
+        row_is_visible = (torch.arange(height) + row_shift) % period < visible_px
+        column_is_visible = (torch.arange(width) + column_shift) % period < visible_px
         # A pixel is in a black square if neither its row nor its column is visible.
         return (row_is_visible[:, None] | column_is_visible).float()

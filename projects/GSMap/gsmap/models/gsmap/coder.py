@@ -10,13 +10,16 @@ from gsmap.utils.errors import InputError
 
 
 class GaussianCoder(MapCoder):
-    """Coder of the detections of a head with Gaussians.
+    """Coder of the detections of a head with Gaussians, one for each point of an element.
+
+    `MapCoder` selects the detections with the highest scores. Here, scores are first raised for
+    elements whose points are sharp, and lowered for blurred ones.
 
     Args:
         grid: Extent of the map.
-        sigma_power: Exponent >= 0. The odds of a score are divided by sigma to this power, where
-            sigma is the geometric mean over the points of the element of each point's smaller
-            sigma, in metres.
+        sigma_power: Exponent >= 0; 0 leaves the scores unchanged. The odds of a score are divided
+            by sigma to this power. The Gaussian of each point has two sigmas, in metres, of which
+            the smaller one is used. Sigma is the geometric mean of these values over the element.
         kwargs: Further arguments of `MapCoder`.
 
     Raises:
@@ -30,7 +33,7 @@ class GaussianCoder(MapCoder):
         self.sigma_power = sigma_power
 
     def weigh_scores(self, scores: Tensor, fields: Tensors) -> Tensor:
-        """Add the preference for small sigmas to class logits.
+        """Add the preference for small sigmas to class logits, before detections are selected.
 
         Args:
             scores: Class logits. (N, classes)
@@ -41,5 +44,7 @@ class GaussianCoder(MapCoder):
         """
         if not self.sigma_power:
             return scores
+        # The logit is the logarithm of the odds, so a division of the odds is a difference here.
+        # The mean of logarithms is the logarithm of the geometric mean.
         log_sigma = fields["scales"].amin(-1).log().mean(-1, keepdim=True)  # (N, 1)
         return scores.float() - self.sigma_power * log_sigma

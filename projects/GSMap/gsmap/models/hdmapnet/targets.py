@@ -29,7 +29,8 @@ class MakeLineMaps(BaseTransform):
     ``gt_lines`` (classes, H, W) contains the number of the line at each pixel, or 0 without a line.
     The lines of a sample are numbered from 1 across all classes. ``gt_directions`` (2, H, W)
     contains the forward and the backward direction of the line, from 1 to K, or 0 without a line.
-    The first row is at the right of the vehicle, and the first column at the rear.
+    The first row is at the right of the vehicle, and the first column at the rear. A line is a
+    part of an element inside the map. An element may have several parts.
 
     Args:
         num_classes: Number of classes.
@@ -65,6 +66,7 @@ class MakeLineMaps(BaseTransform):
         Raises:
             ValueError: If the sample has no ground truth, or an element of an unknown class.
         """
+        # ``map_instances`` of the sample; `self` names this transform in an error.
         elements = ground_truth_elements(results, self)
         grid = BEVGrid(results["x_range"], results["y_range"], forward=self.forward)
         numbers, directions = self.draw(elements, grid.rasterized(self.pixel_m))
@@ -80,7 +82,8 @@ class MakeLineMaps(BaseTransform):
             grid: Raster of the pixels.
 
         Returns:
-            Line numbers (classes, H, W) and directions (2, H, W).
+            Line numbers (classes, H, W) and directions (2, H, W): forward, then backward. The
+            direction of travel is along the columns.
         """
         size = forward_size(grid)
         numbers = np.zeros((self.num_classes, *size), dtype=np.int16)
@@ -93,6 +96,7 @@ class MakeLineMaps(BaseTransform):
                 color=(number,),
                 thickness=self.thickness_px,
             )
+            # Forward direction, then backward direction.
             self.draw_directions(directions[0, label], line)
             self.draw_directions(directions[1, label], line[::-1])
             gap = np.zeros(size, dtype=np.uint8)
@@ -110,6 +114,7 @@ class MakeLineMaps(BaseTransform):
             points: Vertices (column, row) of the line. (n, 2)
         """
         for start, end in zip(points[:-1].tolist(), points[1:].tolist(), strict=True):
+            # Counted from the direction of increasing columns towards increasing rows.
             angle = np.degrees(np.arctan2(end[1] - start[1], end[0] - start[0])) % 360
             step = int(angle / (360 / self.num_directions) + 0.5)  # rounded
             direction = step % self.num_directions + 1  # 1 to K, as 0 means no line

@@ -1,4 +1,7 @@
-"""Initialisation of queries by the map of earlier frames."""
+"""Initialisation of queries by the map of earlier frames.
+
+The map is a raster of cells. `raster_prior.py` selects the cells in which it is known.
+"""
 
 from typing import Any, NamedTuple
 
@@ -17,7 +20,7 @@ class MapKeys(NamedTuple):
     """Cells of the map to which queries attend.
 
     Attributes:
-        values: Map in each cell, [0, 1]. (B, K, M)
+        values: Values of the M channels of the map in each of K cells, [0, 1]. (B, K, M)
         positions: Positional encoding of each cell. (B, K, C)
         is_valid: False for padding. (B, K)
     """
@@ -77,7 +80,7 @@ class PriorQueries(BaseModule):
 
         Args:
             query: Queries. (B, Q, C)
-            keys: Cells of the map.
+            keys: Cells of the map, of which at least one is given, even if it is padding.
 
         Returns:
             Changes, to be added to the queries; 0 in samples without a valid cell. (B, Q, C)
@@ -95,6 +98,9 @@ class PriorQueries(BaseModule):
 
 class PriorHook(FlowHook):
     """Hook that starts the queries of a batch from the map, and keeps the batch's predictions.
+
+    The head calls `start` before its first decoder layer, and `outputs` after its last one. The
+    predictions are later written to the map.
 
     Args:
         queries: Attention to the map, or None to leave the queries as they are.
@@ -120,6 +126,9 @@ class PriorHook(FlowHook):
         Args:
             head: The head.
             start: Queries of the head and of the previous hooks.
+
+        Returns:
+            ``start`` with new queries. Queries that other hooks have appended are not changed.
         """
         if self.queries is None:
             return start
@@ -131,6 +140,7 @@ class PriorHook(FlowHook):
         new_states = states[:, :num_rows] + change
         # `head.reference` is the module that computes reference points from positional encodings.
         new_references = head.reference.start(new_positions)
+        # References are always of points, so their number may differ from the number of rows.
         num_references = new_references.shape[1]
         queries = Queries(
             state=torch.cat([new_states, states[:, num_rows:]], dim=1),
@@ -145,17 +155,25 @@ class PriorHook(FlowHook):
         Args:
             head: The head.
             layers: Predictions of each layer.
+
+        Returns:
+            ``layers``, unchanged.
         """
         last = layers[-1]
         num_instances = head.query_groups[0].num  # the first group predicts
         points_m = head.reference.metres(last.pts[:, :num_instances].detach().float())
+        # A `LateValues` copies in the background: the host waits only when the values are read.
         self.scores = LateValues(last.scores[:, :num_instances].float())
-        self.points_m = LateValues(points_m[..., :2])
+        self.points_m = LateValues(points_m[..., :2])  # without heights
         return layers
 
 
 def _num_rows(head: Any) -> int:
-    """Number of rows of the states of the head's queries."""
+    """Number of rows of the states of the head's queries.
+
+    A row is a point, or an instance for a decoder of instance queries. In training, all query
+    groups are decoded. In prediction, only the first one is.
+    """
     groups = head.query_groups if head.training else head.query_groups[:1]
     num_instances = sum(group.num for group in groups)
     rows_per_instance = head.num_points if head.decoder.point_queries else 1

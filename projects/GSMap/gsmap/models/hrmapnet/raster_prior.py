@@ -27,10 +27,10 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import LateValues, cached_constant, exclude_from_compile, upload
 from gsmap.utils.errors import InputError
 
-CELLS = "prior_cells"
-KEYS = "prior_keys"
-VALID = "prior_valid"
-"""Names of the outputs of `RasterPrior.fuse`."""
+CELLS = "prior_cells"  # map in each BEV cell, (B, M, H, W)
+KEYS = "prior_keys"  # row-major indices of the keys among the BEV cells, (B, K)
+VALID = "prior_valid"  # False where a key is padding, (B, K)
+"""Names of the outputs of `RasterPrior.fuse`. Keys are the cells to which the queries attend."""
 
 
 class _Pending(NamedTuple):
@@ -41,6 +41,8 @@ class _Pending(NamedTuple):
         places: Place of each sample, or None where it is unknown.
         scores: Class logits. (B, N, classes)
         points_m: Points in metres. (B, N, P, 2)
+
+    Both tensors are copied to the host in the background (`LateValues`).
     """
 
     maps: PlaceMaps
@@ -56,7 +58,7 @@ class RasterPrior(PriorModule, AddsWeights):
     Before a frame, a window of the map is read at the pose of the frame. The BEV features are fused
     with the window, and the queries start from it. After the frame, the predictions are drawn and
     written to the map. Samples need
-    ``lidar2global`` and ``map_name``; a sample without a pose reads an empty map.
+    ``lidar2global``, their pose, and ``map_name``. A sample without a pose reads an empty map.
 
     The maps are emptied whenever the mode of the module is set to training or test (`train`).
     mmengine sets it at the start of each epoch and of each test.
@@ -123,6 +125,7 @@ class RasterPrior(PriorModule, AddsWeights):
         if not 0 <= train_drop < 1:
             raise InputError(f"prior.train_drop must be in [0, 1), got {train_drop}.")
         self.train_drop = train_drop
+        # `window` is a grid of the base class, with cells of `cell_m` metres.
         self.scale = self.window.height // bev_grid.height
         size = (self.scale * bev_grid.height, self.scale * bev_grid.width)
         # The scale is 0 if the cells of the map are larger than the BEV cells.
@@ -144,6 +147,8 @@ class RasterPrior(PriorModule, AddsWeights):
         shared = {"embed_dims": embed_dims, "num_channels": self.num_channels}
         self.bev: PriorBEVFusion | None = None
         if bev is not None:
+            # The layer of the fusion samples images at heights, in the range of the encoder if it
+            # has one.
             heights = {"z_range": encoder.z_range} if hasattr(encoder, "z_range") else {}
             self.bev = build_part(
                 bev,
@@ -161,6 +166,7 @@ class RasterPrior(PriorModule, AddsWeights):
                 queries, type="PriorQueries", zero_init=neutral_start, **shared
             )
             if self.bev is None or self.bev.layer is None:
+                # mmdet's encoding joins two halves, one for the column and one for the row.
                 self.positions = LearnedPositionalEncoding(
                     embed_dims // 2, bev_grid.height, bev_grid.width
                 )
@@ -175,7 +181,7 @@ class RasterPrior(PriorModule, AddsWeights):
         self._maps = self.new_maps()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Attributes of a copy, which begins with empty maps."""
+        """Attributes of a copy or pickle, which begins with empty maps."""
         return {**vars(self), "_pending": [], "_maps": self.new_maps()}
 
     @property
@@ -229,6 +235,7 @@ class RasterPrior(PriorModule, AddsWeights):
         Returns:
             The outputs with fused ``bev_feats``, and the cells of the map for `hook`.
         """
+        # The predictions of the previous batch are written first, so that they can be read.
         self.flush()
         windows = []
         for meta in metas:
@@ -237,14 +244,15 @@ class RasterPrior(PriorModule, AddsWeights):
         cells = F.pixel_unshuffle(torch.stack(windows), self.scale)  # (B, M, H, W), on the CPU
         device = outputs["bev_feats"].device
         calibration = stack_calibration(metas, self.calibration, device)
+        # All tensors are copied to the device together.
         host_tensors = [cells]
         if self.queries is not None:
             host_tensors += self._select_keys(cells)
         cells, *keys = upload(host_tensors, device)
         fused = self.fuse_cells(outputs, cells, calibration, img_shape=img_shape)
         if self.queries is not None:
-            numbers, is_valid = keys
-            fused[KEYS] = numbers
+            cell_indices, is_valid = keys
+            fused[KEYS] = cell_indices
             fused[VALID] = is_valid
         return fused
 
@@ -272,10 +280,12 @@ class RasterPrior(PriorModule, AddsWeights):
         fused = self.fuse_cells(outputs, cells, calibration, img_shape=img_shape)
         if self.queries is not None:
             stride = self.queries.stride  # every `stride`-th cell along both axes is a key
-            numbers = torch.arange(self.cells.height * self.cells.width, device=window.device)
-            numbers = numbers.view(self.cells.height, self.cells.width)[::stride, ::stride]
+            num_cells = self.cells.height * self.cells.width
+            all_indices = torch.arange(num_cells, device=window.device)
+            all_indices = all_indices.view(self.cells.height, self.cells.width)
+            cell_indices = all_indices[::stride, ::stride]
             largest = cells[:, :, ::stride, ::stride].amax(1).flatten(1)  # (B, K)
-            fused[KEYS] = numbers.reshape(1, -1).expand(len(window), -1)
+            fused[KEYS] = cell_indices.reshape(1, -1).expand(len(window), -1)
             fused[VALID] = largest > self.queries.threshold
         return fused
 
@@ -313,13 +323,16 @@ class RasterPrior(PriorModule, AddsWeights):
 
         Args:
             outputs: Outputs of `fuse` or `fuse_window`.
+
+        Returns:
+            The hook. The head calls it, and it then has the predictions of the last layer.
         """
         if self.queries is None:
             return PriorHook(None, None)  # it only keeps the predictions
         cells = outputs[CELLS].flatten(2).transpose(1, 2)  # (B, H * W, M)
-        numbers = outputs[KEYS]  # row-major indices of the cells, (B, K)
-        values = cells.gather(1, numbers[..., None].expand(-1, -1, cells.shape[-1]))
-        positions = self._cell_positions(cells)[numbers]  # (B, K, C)
+        cell_indices = outputs[KEYS]  # row-major indices of the cells, (B, K)
+        values = cells.gather(1, cell_indices[..., None].expand(-1, -1, cells.shape[-1]))
+        positions = self._cell_positions(cells)[cell_indices]  # (B, K, C)
         return PriorHook(self.queries, MapKeys(values, positions, is_valid=outputs[VALID]))
 
     def keep(self, hook: PriorHook, metas: Sequence[Mapping[str, Any]]) -> None:
@@ -329,6 +342,8 @@ class RasterPrior(PriorModule, AddsWeights):
             hook: Hook of the batch, after the head has run.
             metas: Metainfo of each sample.
         """
+        # The hook has no predictions before the head has run. `writes` is False for maps that
+        # are only read.
         if hook.scores is None or hook.points_m is None or not self.maps.writes:
             return
         places = [Place.of(meta) for meta in metas]
@@ -339,7 +354,7 @@ class RasterPrior(PriorModule, AddsWeights):
         pending = list(self._pending)
         self._pending.clear()
         for batch in pending:
-            all_scores = batch.scores.read()
+            all_scores = batch.scores.read()  # waits for the copy to the host
             all_points_m = batch.points_m.read()
             for index, place in enumerate(batch.places):
                 raster = self.draw(all_scores[index], all_points_m[index])
@@ -356,6 +371,7 @@ class RasterPrior(PriorModule, AddsWeights):
         Returns:
             Values in [0, 1]. (classes, h, w)
         """
+        # Best pairs of query and class: a query may occur with several classes.
         best = self.coder.decode(scores, points_m)
         is_sure = best.scores > self.score_threshold
         return draw_elements(
@@ -385,13 +401,14 @@ class RasterPrior(PriorModule, AddsWeights):
         is_known = torch.zeros(len(cells), self.cells.height, self.cells.width, dtype=torch.bool)
         largest = cells[:, :, ::stride, ::stride].amax(1)
         is_known[:, ::stride, ::stride] = largest > self.queries.threshold
-        numbers = [known.flatten().nonzero()[:, 0] for known in is_known]
-        length = max(1, *(len(sample) for sample in numbers))
+        known_indices = [known.flatten().nonzero()[:, 0] for known in is_known]
+        # All samples are padded to the length of the longest one. Attention needs one key at least.
+        length = max(1, *(len(indices) for indices in known_indices))
         padded = torch.zeros(len(cells), length, dtype=torch.long)
         is_valid = torch.zeros(len(cells), length, dtype=torch.bool)
-        for row, sample in enumerate(numbers):
-            padded[row, : len(sample)] = sample
-            is_valid[row, : len(sample)] = True
+        for row, indices in enumerate(known_indices):
+            padded[row, : len(indices)] = indices
+            is_valid[row, : len(indices)] = True
         return [padded, is_valid]
 
     def _cell_positions(self, like: Tensor) -> Tensor:
@@ -401,6 +418,7 @@ class RasterPrior(PriorModule, AddsWeights):
             assert self.bev is not None
             encoding = self.bev.layer.positional_encoding
         shape = (1, self.cells.height, self.cells.width)
+        # A mask of zeros: mmdet's encodings take 0 for a valid cell.
         mask = cached_constant(like, ("prior cells", *shape), lambda: like.new_zeros(shape))
         return encoding(mask)[0].flatten(1).T
 
@@ -411,6 +429,9 @@ def _build_rule(settings: Mapping[str, Any] | None, default: str) -> WriteRule:
     Args:
         settings: Name of the rule as ``name``, and settings of the rule; or None.
         default: Name of the rule if ``settings`` has none.
+
+    Raises:
+        ValueError: If the rule is unknown, or does not have one of the settings.
     """
     arguments = {"name": default, **(settings or {})}
     name = arguments.pop("name")

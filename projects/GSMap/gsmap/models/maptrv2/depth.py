@@ -19,7 +19,7 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
         depth_range: Start of the first bin, end of the last bin, and size of a bin, in metres.
 
     Returns:
-        Indices of bins, int64; -1 without a target. (..., H / stride, W / stride)
+        Indices of bins, int64; -1 in blocks without a target. (..., H / stride, W / stride)
 
     Raises:
         ValueError: If the size is not a multiple of ``stride``.
@@ -30,6 +30,7 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
             f"depth_m must have a size divisible by stride {stride}, got {height} x {width}."
         )
     low, _, step = depth_range
+    # Blocks are h rows and w columns, and each has s x s pixels.
     blocks = depth_m.unflatten(dim=-1, sizes=(-1, stride))
     blocks = blocks.unflatten(dim=-3, sizes=(-1, stride))  # (..., h, s, w, s)
     # A pixel without a return is infinitely far, beyond all bins.
@@ -48,7 +49,7 @@ def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
 
     Args:
         probs: Probabilities of the bins. (..., D, h, w)
-        bins: Indices of the target bins, -1 without a target. (..., h, w)
+        bins: Indices of the target bins, -1 without a target, from `depth_bins`. (..., h, w)
 
     Returns:
         The mean over pixels with a target; 0 if there is none. ()
@@ -62,6 +63,8 @@ def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
             f"for {tuple(probs.shape)}."
         )
     valid = bins >= 0
+    # Bin 0 stands in where there is no target. Its probability is replaced by 1 below, whose
+    # logarithm is 0.
     indices = bins.clamp(min=0).unsqueeze(-3)
     target_probs = probs.float().gather(dim=-3, index=indices).squeeze(-3)  # (..., h, w)
     smallest_prob = torch.finfo(target_probs.dtype).tiny  # avoids log(0)
