@@ -35,7 +35,8 @@ def main() -> None:
     """Run the benchmark of the command line."""
     parser = CommandParser(description=__doc__)
     subparsers = parser.add_subparsers(required=True)
-    # Empty if the first argument is no command, such as --help. Then all commands are added.
+    # The command in the first argument. The set is empty if this argument is no command, such as
+    # --help. Then all commands are added, so that the help lists them.
     requested = COMMANDS.keys() & set(sys.argv[1:2])
     for name in sorted(requested or COMMANDS):
         module = importlib.import_module(f"benchmarks.{COMMANDS[name]}")

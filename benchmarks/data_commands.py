@@ -1,4 +1,4 @@
-"""Speed and memory of loading, ground truth and pipeline, as in results/speed.md."""
+"""Speed and memory of loading, ground truth, pipelines and conversion, as in results/speed.md."""
 
 import argparse
 import json
@@ -13,7 +13,7 @@ from benchmarks.memory import measure_memory
 
 
 def loading(args: argparse.Namespace) -> dict[str, float]:
-    """Measure the loading of a tiled annotation file."""
+    """Measure the loading of an annotation file, tiled (its samples repeated) to ``--samples``."""
     with tempfile.TemporaryDirectory() as folder:
         tiled = Path(folder, "tiled.arrow")
         data.tile_annotations(args.annotations, tiled, count=args.samples)
@@ -21,12 +21,12 @@ def loading(args: argparse.Namespace) -> dict[str, float]:
 
 
 def ground_truth(args: argparse.Namespace) -> dict[str, float]:
-    """Measure the computation of the ground truth of a frame."""
+    """Measure two ways to compute the ground truth of a frame of nuScenes."""
     return data.measure_ground_truth(args.root, args.annotations)
 
 
 def pipeline(args: argparse.Namespace) -> dict[str, float]:
-    """Measure the training pipeline."""
+    """Measure the training pipeline with two sources of ground truth."""
     # Imported here, since the other subcommands do not need these slow imports.
     from mmengine.config import Config
     from mmengine.registry import init_default_scope
@@ -67,23 +67,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--samples", type=int, default=28_130)  # nuScenes' training samples
     command.set_defaults(measure=loading)
     command = commands.add_parser(
-        "ground-truth", help="ground truth of a frame, with and without maps prepared once"
+        "ground-truth",
+        help="ground truth of a frame, from a prepared map and from all records of the map",
     )
     command.add_argument("root", type=Path)
     command.add_argument("annotations", type=Path)
     command.set_defaults(measure=ground_truth)
     command = commands.add_parser(
-        "pipeline", help="training samples, with ground truth from the file or computed for each"
+        "pipeline",
+        help="time per training sample, with ground truth from the file and computed for each",
     )
     command.add_argument("root", type=Path)
     command.add_argument("annotations", type=Path)
     command.add_argument("--config", default="configs/_base_/datasets/minicity.py")
     command.add_argument("--samples", type=int, default=20)
     command.set_defaults(measure=pipeline)
-    command = commands.add_parser("images", help="image transforms of a sample, samples a second")
-    command.add_argument("folder", type=Path, help="six JPEG files, such as a frame of nuScenes")
+    command = commands.add_parser("images", help="time of the image transforms of a sample")
+    command.add_argument(
+        "folder", type=Path, help="folder of six JPEG files, such as a frame of nuScenes"
+    )
     command.add_argument("--samples", type=int, default=10)
-    command.add_argument("--workers", type=int, nargs="*", default=[], help="numbers of processes")
+    command.add_argument(
+        "--workers",
+        type=int,
+        nargs="*",
+        default=[],
+        help="also measure samples per second with each of these numbers of worker processes",
+    )
     command.set_defaults(measure=images)
     command = commands.add_parser("av2", help="Argoverse 2 ground truth per frame")
     command.add_argument("root", type=Path)

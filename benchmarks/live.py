@@ -50,14 +50,15 @@ def run(args: argparse.Namespace) -> None:
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, size=(height, width, 3), dtype=np.uint8)
     images = dict.fromkeys(camera_names, pixels)  # one image is enough to measure the time
-    # `ring_of_cameras` returns intrinsics times extrinsics. Its intrinsics are repeated here, so
-    # that the extrinsics follow from the product.
+    # The inferencer takes intrinsics and extrinsics apart, but `ring_of_cameras` returns their
+    # product. `img_from_cam` equals the intrinsics in that function, so its inverse times the
+    # product gives the extrinsics. "ref" is the frame of the map (x right, y forward, z up).
     img_from_cam = np.eye(4)
     img_from_cam[:2, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2]]
-    img_from_frame = ring_of_cameras(len(camera_names), height=height, width=width)  # (V, 4, 4)
-    cam_from_frame = np.linalg.inv(img_from_cam) @ img_from_frame  # (V, 4, 4)
+    img_from_ref = ring_of_cameras(len(camera_names), height=height, width=width)  # (V, 4, 4)
+    cam_from_ref = np.linalg.inv(img_from_cam) @ img_from_ref  # (V, 4, 4)
     intrinsics = dict.fromkeys(camera_names, img_from_cam[:3, :3])
-    extrinsics = dict(zip(camera_names, cam_from_frame, strict=True))
+    extrinsics = dict(zip(camera_names, cam_from_ref, strict=True))
     predict_live = inferencer.live(intrinsics, extrinsics)
     calls = {
         "live(images)": partial(predict_live, images),

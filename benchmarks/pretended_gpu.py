@@ -254,9 +254,9 @@ class PretendedGPU(TorchDispatchMode):
             return func(*args, **kwargs)
         if self._in_backward:
             self._part = self._part_of_gradient()
-        if func is aten._to_copy.default:
+        if func is aten._to_copy.default:  # `Tensor.to` with another type or device
             return self._convert(args[0], kwargs)
-        if func is aten.copy_.default:
+        if func is aten.copy_.default:  # `Tensor.copy_`
             return self._copy_into(*args, **kwargs)
         name = str(func).removeprefix("aten.").removesuffix(".default")
         if on_gpu:
@@ -309,13 +309,13 @@ class PretendedGPU(TorchDispatchMode):
         return return_and_correct_aliasing(func, args, kwargs=kwargs, out=result)
 
     def _convert(self, source: Tensor, kwargs: dict[str, Any]) -> Tensor:
-        """Copy a tensor to another type or device.
+        """Copy a tensor to another type or device. The source or the result is a pretended tensor.
 
         Args:
             source: Tensor on the CPU or on the device.
             kwargs: Arguments of ``aten._to_copy`` by name, such as ``device`` and ``dtype``.
         """
-        target = kwargs.get("device")
+        target = kwargs.get("device")  # without it, the tensor stays on its device
         device_type = torch.device(target).type if target is not None else source.device.type
         is_blocking = not kwargs.get("non_blocking")
         options = {k: v for k, v in kwargs.items() if k not in ("device", "pin_memory")}
@@ -453,25 +453,27 @@ def _line_of_project() -> str:
 
 @cache
 def _short_name(file: str) -> str | None:
-    """Short name of a file of the project or of OpenMMLab; None for this and for other files.
+    """Short name of a file of the project or of OpenMMLab; None for this file and all others.
 
     The name is relative to the repository, or to ``site-packages`` for OpenMMLab.
     """
     path = Path(file)
     if path.is_relative_to(ROOT) and "site-packages" not in path.parts:
         return str(path.relative_to(ROOT)) if path != Path(__file__) else None
-    # The packages of OpenMMLab are mmcv, mmdet, mmdet3d and mmengine.
-    if any(folder.startswith("mm") for folder in path.parts):
-        packages = path.parts[path.parts.index("site-packages") + 1 :]
-        return "/".join(packages)
-    return None
+    if "site-packages" not in path.parts:
+        return None
+    # The first folder is the package. The packages of OpenMMLab are mmcv, mmdet, mmdet3d and
+    # mmengine.
+    folders = path.parts[path.parts.index("site-packages") + 1 :]
+    return "/".join(folders) if folders[0].startswith("mm") else None
 
 
 def _num_launches(name: str, args: Any) -> int:
     """Number of kernels of an operation.
 
-    Operations on lists of tensors need one kernel for each group of tensors, whose size is in
-    ``_TENSORS_PER_LAUNCH``.
+    Operations on lists of tensors, all of one length, need one kernel for each group of tensors.
+    ``_TENSORS_PER_LAUNCH`` has the size of a group. Its last entry is also used for more than five
+    lists.
     """
     if not name.startswith(("_foreach", "_fused_adam", "_fused_sgd")):
         return 1

@@ -56,14 +56,16 @@ def choose_start(cfg: Config, resume: str | None) -> None:
     """Set and check the checkpoint from which the run resumes or takes its initial weights.
 
     Args:
-        cfg: Config of the run; ``resume`` and ``load_from`` are set. With ``resume``, the run also
-            continues with the optimizer and the number of iterations in the checkpoint.
-        resume: Value of ``--resume``: a checkpoint, ``auto`` for the newest one in the work folder,
-            or None to start a training.
+        cfg: Config of the run, changed in place. ``load_from`` becomes the checkpoint. ``resume``
+            becomes True if the run continues with the optimizer and the number of iterations in
+            the checkpoint, and False if it takes only the weights.
+        resume: Value of ``--resume``: a checkpoint; ``auto`` for the newest one in the work folder,
+            if there is one; or None to start a training, from ``cfg.load_from`` if it is set.
 
     Raises:
         FileNotFoundError: If the checkpoint does not exist.
-        ValueError: If the checkpoint cannot be loaded, or the run would replace it.
+        ValueError: If the checkpoint cannot be loaded, or a new training would start from a
+            checkpoint in its work folder, which it would replace.
     """
     from gsmap.checkpoints.reading import read_weights
     from gsmap.engine.launch import newest_checkpoint
@@ -75,7 +77,8 @@ def choose_start(cfg: Config, resume: str | None) -> None:
         resume = newest
     cfg.resume = resume is not None
     cfg.load_from = resume or cfg.get("load_from")
-    # The runner downloads an address. Files and names of models are checked here.
+    # A URL is not checked here, because only the runner downloads it. Any other value is a file or
+    # the name of a model, which `find_checkpoint` replaces by the path of the model's file.
     if cfg.load_from and "://" not in str(cfg.load_from):
         cfg.load_from = str(find_checkpoint(cfg.load_from))
         read_weights(cfg.load_from)  # raises an error for a file that cannot be loaded
@@ -91,11 +94,15 @@ def lock_work_dir(work_dir: str) -> AbstractContextManager:
 
     Returns:
         Context manager that unlocks the folder at its end; without effect in other ranks.
+
+    Raises:
+        RuntimeError: If another run has locked the folder.
+        ValueError: If another program has written the lock file.
     """
     if not is_first_rank():
         return nullcontext()
     advice = "wait for its end, or give another --work-dir"
-    return lock_folder(Path(work_dir), ".training", advice)
+    return lock_folder(Path(work_dir), ".training", advice=advice)
 
 
 def main() -> None:
@@ -113,7 +120,8 @@ def main() -> None:
         args.work_dir = str(Path("work_dirs") / f"{Path(args.config).stem}_overfit")
     cfg = load_config(args)
     if args.overfit is not None:
-        overfit(cfg, args.overfit, args.overfit_iterations)  # changes the config in place
+        # This changes the config in place.
+        overfit(cfg, samples=args.overfit, iterations=args.overfit_iterations)
     if args.amp and torch.cuda.is_available():
         cfg.optim_wrapper.type = "MapAmpOptimWrapper"  # float16, with a scaled loss
         cfg.optim_wrapper.setdefault("loss_scale", "dynamic")
@@ -123,8 +131,10 @@ def main() -> None:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
             raise InputError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
+    # Locked before the checkpoint is chosen, so that no other run writes checkpoints meanwhile.
     with lock_work_dir(cfg.work_dir):
         choose_start(cfg, args.resume)
+        # As in mmengine's tools, a config may name another class of runners.
         runner_type = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
         with building(cfg):  # adds the names of the config and of its parts to errors
             runner = runner_type.from_cfg(cfg)

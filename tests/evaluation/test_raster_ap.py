@@ -238,6 +238,12 @@ def test_far_points_do_not_overflow():
     assert not masks[1].any()
 
 
+def test_no_sample_at_all_has_no_iou():
+    assert len(MatchTable([]).class_iou(0)) == 0
+    metrics = raster_report(MatchTable([]), TINY).metrics
+    assert metrics["raster/mAP"] == -1.0
+
+
 def test_bad_configuration_is_refused():
     for classes in ((), "divider"):
         with pytest.raises(ValueError, match="classes must be names"):

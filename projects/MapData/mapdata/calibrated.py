@@ -1,4 +1,7 @@
-"""Records of samples whose cameras and poses come from a calibration file (docs/custom_data.md)."""
+"""Records of samples whose cameras and poses come from a calibration file (docs/custom_data.md).
+
+The rig is the set of cameras on a vehicle. The calibration file describes it.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -24,15 +27,16 @@ def calibrated_records(
 ) -> Iterator[dict[str, Any]]:
     """Add the cameras and the poses of a calibration file to records, the dictionaries of samples.
 
-    The cameras of a record have ``name`` and ``path``. A camera whose image was taken at another
-    time than ``timestamp_ns`` of the record also has a ``timestamp_ns``. If the file names
-    ``poses``, ``cam_from_frame`` of such a camera includes the vehicle's motion between the two
-    times.
+    The cameras of a record have ``name`` and ``path``. A camera has a ``timestamp_ns`` if its image
+    was taken at another time than the ``timestamp_ns`` of the record. If the calibration file names
+    a file of ``poses``, ``cam_from_frame`` of such a camera includes the vehicle's motion between
+    the two times.
 
     Args:
         records: Records, as `mapdata.custom.from_records` takes them.
         file: Calibration file, YAML or JSON.
-        meta: Annotation frame, and height of the road in it.
+        meta: Metadata of the annotation file, with the annotation frame and the height of the road
+            in it.
         root: Folder that image paths are relative to.
 
     Yields:
@@ -49,27 +53,32 @@ def calibrated_records(
     images: dict[str, list[Path]] = {}
     # Time of each image, by its file name without the suffix. A file of poses may refer to images
     # by these names. If several images have one name, the time of the last image is used.
-    time_of: dict[str, int] = {}
+    image_times: dict[str, int] = {}
     for number, record in enumerate(records):
         # Errors in this context get the name of the record, and the advice.
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             for camera in record["cameras"]:
                 _require_keys(camera, file)
                 images.setdefault(str(camera["name"]), []).append(root / camera["path"])
-                time_of[Path(camera["path"]).stem] = _time_of(camera, record)
-    rig, poses = read_vehicle(file, images=images, time_of=time_of)
+                image_times[Path(camera["path"]).stem] = _image_time_ns(camera, record)
+    # The cameras that have images, and the poses of the road below the vehicle. Without a file of
+    # poses, `poses` is None.
+    rig, poses = read_vehicle(file, images=images, time_of=image_times)
     camera_of = {camera.name: camera for camera in rig}
-    # Pose of the road below the vehicle at a time. Cached, since cameras often share their times.
+    # Function from a time in nanoseconds to the pose of the vehicle: the transform to the global
+    # frame from the frame on the road below the vehicle. It returns None if no pose is near the
+    # time. Cached, since cameras often share their times.
     pose_at = None if poses is None else cache(poses.at)
     for number, record in enumerate(records):
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
-            frame = _rig_frame(record, camera_of=camera_of, file=file)
+            rig_frame = _rig_frame(record, camera_of=camera_of, file=file)
             if pose_at is not None and record.get(_POSE) is not None:
                 raise InputError(f"{_POSE} is given, and {file} has poses, too: leave out one.")
             scene = str(record.get("scene") or "")
-            samples = rig_samples(scene, rig, frames=[frame], pose_at=pose_at)
-            if not samples:  # `rig_samples` leaves out a frame without a pose
-                raise InputError(f"{file} has no pose near timestamp_ns {frame.time_ns}.")
+            samples = rig_samples(scene, rig, frames=[rig_frame], pose_at=pose_at)
+            if not samples:  # `rig_samples` leaves out a `RigFrame` without a pose
+                raise InputError(f"{file} has no pose near timestamp_ns {rig_frame.time_ns}.")
+            # `rig_samples` returns samples in the frame `ego`.
             sample = _in_frame(samples[0], record=record, meta=meta)
             completed = {**record, "ego_from_frame": sample.ego_from_frame}
             if pose_at is not None:
@@ -77,7 +86,9 @@ def calibrated_records(
             cameras = []
             for camera in sample.cameras:
                 rig_camera = camera_of[camera.name]
-                entry = dict(vars(camera))  # a copy of the fields of the sample's camera
+                # The fields of the sample's camera, to which the distortion is added. They are
+                # copied, so that the camera does not change.
+                entry = dict(vars(camera))
                 entry["distortion"] = rig_camera.distortion
                 entry["distortion_model"] = rig_camera.model
                 cameras.append(entry)
@@ -92,16 +103,16 @@ def _name_of(record: Any, number: int) -> Any:
 
 def _require_keys(camera: Mapping[str, Any], file: Path) -> None:
     """Raise a ``ValueError`` if a camera has keys that the calibration file defines."""
-    others = sorted(set(camera) - _KEYS)
-    if others:
+    other_keys = sorted(set(camera) - _KEYS)
+    if other_keys:
         raise InputError(
-            f"camera {camera.get('name')!r} has {others}, which {file} defines: leave them out. "
-            f"Beside a calibration file, cameras have only {sorted(_KEYS)}."
+            f"camera {camera.get('name')!r} has {other_keys}, which {file} defines: leave them "
+            f"out. Beside a calibration file, cameras have only {sorted(_KEYS)}."
         )
 
 
-def _time_of(camera: Mapping[str, Any], record: Mapping[str, Any]) -> int:
-    """Return the time of a camera's image in nanoseconds."""
+def _image_time_ns(camera: Mapping[str, Any], record: Mapping[str, Any]) -> int:
+    """Return the time of a camera's image in nanoseconds; 0 if no time is given."""
     time_ns = camera.get("timestamp_ns")
     if time_ns is None:
         time_ns = record.get("timestamp_ns") or 0
@@ -113,6 +124,14 @@ def _rig_frame(
 ) -> RigFrame:
     """Collect the images of a record by camera, as the input of `rig_samples`.
 
+    Args:
+        record: Record of a sample.
+        camera_of: Cameras of the calibration file by name.
+        file: Calibration file, for the error.
+
+    Returns:
+        Token and time of the record, and the path and time in nanoseconds of each camera's image.
+
     Raises:
         ValueError: If the calibration file lacks a camera.
     """
@@ -121,13 +140,19 @@ def _rig_frame(
         name = str(camera["name"])
         if name not in camera_of:
             raise InputError(f"camera {name!r} is not in {file}, which has {sorted(camera_of)}.")
-        images[name] = (str(camera["path"]), _time_of(camera, record))
+        images[name] = (str(camera["path"]), _image_time_ns(camera, record))
     time_ns = int(record.get("timestamp_ns") or 0)
     return RigFrame(str(record["token"]), time_ns=time_ns, images=images)
 
 
 def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta) -> MapSample:
-    """Transform a sample from the frame ``ego`` to the frame of the annotation file."""
+    """Transform a sample from the frame ``ego`` to the annotation frame.
+
+    Args:
+        sample: Sample of `rig_samples`.
+        record: Record of the sample, with ``ego_from_frame`` (4, 4) if the mounting is known.
+        meta: Annotation frame, and height of the road in it.
+    """
     ground_z_m = meta.ground_z_m
     # `ego_from_frame` of a record is the mounting of the sensor that defines the annotation frame.
     # Without it, the usual mounting is assumed.
@@ -135,8 +160,8 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
     if ego_from_frame is None:
         mount = Mount(meta.frame, ground_z_m=ground_z_m)
     else:
-        # `ground_from_frame` reads the mounting from a sample. So the mounting is set in a copy,
-        # which has no other use.
+        # `ground_from_frame` takes a sample, of which it uses only the mounting. So the mounting of
+        # the record is set in a copy of the sample.
         sample_with_mount = replace(sample, ego_from_frame=np.asarray(ego_from_frame, np.float64))
         ground = ground_from_frame(sample_with_mount, meta.frame, ground_z_m=ground_z_m)
         mount = Mount(meta.frame, ground_z_m=ground_z_m, ground_from_frame=ground)

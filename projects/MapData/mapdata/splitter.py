@@ -29,6 +29,7 @@ def _near_scenes(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -
     tree = cKDTree(positions)
     for scene in range(count):
         neighbours = tree.query_ball_point(positions[scenes == scene], distance_m)
+        # Samples of any scene that are near a sample of this scene.
         samples = np.unique(np.concatenate(neighbours).astype(np.int64))
         near[scene, scenes[samples]] = True
     return near | near.T  # symmetric despite rounding errors of distances
@@ -39,20 +40,21 @@ def _select_scenes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Select scenes of a map for validation, one after another.
 
-    Scenes near a selected scene are lost for training. The first scene is random. Each further
-    scene is the one by which training loses the fewest additional scenes.
+    A selected scene and the scenes near it are lost for training. The first scene is random. Each
+    further scene is the one by which training loses the fewest additional scenes.
 
     Args:
-        near: Whether two scenes are near each other. (S, S)
-        count: Number of scenes to select.
+        near: Whether two scenes are near each other; a scene is near itself. (S, S)
+        count: Number of scenes to select, in [1, S].
         rng: Source of the random order.
 
     Returns:
-        Mask of the selected scenes (S,), and mask of scenes that are not near a selected one (S,).
+        Mask of the selected scenes (S,), and mask of scenes that are neither selected nor near a
+        selected scene (S,).
     """
-    rank = rng.permutation(len(near))
+    rank = rng.permutation(len(near))  # random rank of each scene, which decides between equals
     selected = np.zeros(len(near), dtype=bool)
-    covered = np.zeros(len(near), dtype=bool)
+    covered = np.zeros(len(near), dtype=bool)  # selected scenes and scenes near them
     scene = int(rank.argmin())
     while True:
         selected[scene] = True
@@ -62,7 +64,8 @@ def _select_scenes(
         # Column j of `near` is scene j; scenes that are already covered are lost anyway.
         num_lost = (near & ~covered).sum(1)  # scenes that training would lose with each scene
         others = np.flatnonzero(~selected)
-        order = np.lexsort((rank[others], num_lost[others]))  # by loss, then by rank
+        # `lexsort` sorts by its last key first: by loss, then by rank.
+        order = np.lexsort((rank[others], num_lost[others]))
         scene = int(others[order[0]])
 
 
@@ -71,11 +74,11 @@ def split_scenes(
 ) -> dict[str, list[str]]:
     """Split scenes so that no validation sample is near a training sample.
 
-    Each map gives about an equal share of its scenes to validation. Scenes near validation scenes
-    are in neither part. The split depends on the arguments only.
+    Each map gives about an equal share of its scenes to validation. Other scenes near validation
+    scenes are in neither part. The split depends on the arguments only.
 
     Args:
-        places: Positions of the samples.
+        places: Positions of the samples, with the scene and the map of each.
         min_distance_m: Least distance between samples of the two parts, in metres, >= 0.
         val_share: Share of the scenes for validation, in (0, 1).
         seed: Seed of the random order of scenes, >= 0.
@@ -110,6 +113,7 @@ def split_scenes(
             f"{len(parts['val'])} for validation: give a smaller --min-distance, or another "
             "--val-share."
         )
+    # A set, because a scene with samples on several maps was added once for each map.
     return {part: sorted(set(names)) for part, names in parts.items()}
 
 
@@ -128,7 +132,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Run the command ``split``: write a split, and return its sizes and distance."""
+    """Run the command ``split``: write a split, and return a summary of its sizes and distance.
+
+    Raises:
+        ValueError: If the scenes cannot be split (`split_scenes`).
+    """
     places = read_places(arguments.files)
     parts = split_scenes(
         places,

@@ -60,8 +60,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 
 
-# Options that a preset sets. Except for ``image_size``, these are also fields of `MiniCityConfig`.
-SIZE_OPTIONS = (
+# All options that a preset sets: sizes, numbers, the seed and a share. They are fields of
+# `MiniCityConfig`, except for ``image_size``, which sets the fields ``image_width`` and
+# ``image_height``.
+PRESET_OPTIONS = (
     "scenes",
     "seed",
     "image_size",
@@ -85,10 +87,10 @@ def chosen_config(arguments: argparse.Namespace) -> MiniCityConfig:
 
     Raises:
         ValueError: If neither a preset nor ``--scenes`` is given, if a preset is given together
-            with an option of size, or if a value is out of range.
+            with an option that it sets, or if a value is out of range.
     """
     values: dict[str, Any] = {}
-    for name in SIZE_OPTIONS:
+    for name in PRESET_OPTIONS:
         value = getattr(arguments, name)
         if value is not None:  # the option was given
             values[name] = value
@@ -116,6 +118,10 @@ def run(arguments: argparse.Namespace) -> str:
     Returns:
         Summary for the user: the folder and the command that generated it, or a note that the data
         set was complete already.
+
+    Raises:
+        ValueError: If the options contradict each other or are out of range (`chosen_config`), or
+            if the data set cannot be generated.
     """
     config = chosen_config(arguments)
     is_new = generate(  # False if the folder already contains this data set

@@ -20,8 +20,8 @@ class CrossSection:
     Offsets are in metres, positive to the left of the centre line. Forward lanes lie on its right.
 
     Attributes:
-        forward: Number of lanes along the centre line.
-        backward: Number of lanes against the centre line; 0 for a one-way road.
+        forward: Number of lanes with traffic in the direction of the centre line.
+        backward: Number of lanes with traffic against it; 0 for a one-way road.
         lane_m: Width of a lane in metres.
         median_m: Width of the raised strip between the directions in metres; 0 for none.
         right_shoulder_m: Width between the outermost forward lane and the right kerb, in metres.
@@ -37,12 +37,18 @@ class CrossSection:
 
     @property
     def forward_edges(self) -> list[float]:
-        """Offsets of the edges of the forward lanes, from the centre to the right kerb."""
+        """Offsets of the edges of the forward lanes, from the innermost to the outermost edge.
+
+        The outermost edge is at the right kerb only without a shoulder.
+        """
         return [-self.median_m / 2 - i * self.lane_m for i in range(self.forward + 1)]
 
     @property
     def backward_edges(self) -> list[float]:
-        """Offsets of the edges of the backward lanes, from the centre to the left kerb."""
+        """Offsets of the edges of the backward lanes, from the innermost to the outermost edge.
+
+        The outermost edge is at the left kerb only without a shoulder.
+        """
         return [self.median_m / 2 + i * self.lane_m for i in range(self.backward + 1)]
 
     @property
@@ -129,13 +135,17 @@ class Road:
         section: Lanes across the road.
         style: Paint and surface.
         crossings: Arc lengths (start, end) of pedestrian crossings, in any order.
-        clear_start_m: Arc length at which divider paint begins.
-        clear_end_m: Arc length at which divider paint ends. 0, the default, is replaced by the
-            whole length.
-        stop_forward: Arc lengths (start, end) of the stop line for forward lanes, or None.
-        stop_backward: Arc lengths (start, end) of the stop line for backward lanes, or None.
-        shift_m: Shift of the painted lines between lanes from the offsets of ``section``, in
-            metres, positive to the left. Kerbs and medians are not shifted.
+        clear_start_m: Arc length at which divider paint begins, beyond a crossing or a stop line
+            at the start of the road.
+        clear_end_m: Arc length at which divider paint ends, before a stop line or a crossing at
+            the end of the road. 0, the default, is replaced by the length of the road.
+        stop_forward: Arc lengths (start, end) of the stop line for forward lanes, which lies near
+            the end of the road; None without one.
+        stop_backward: Arc lengths (start, end) of the stop line for backward lanes, which lies near
+            the start of the road; None without one.
+        shift_m: Distance in metres by which the painted lines between lanes are moved from the
+            offsets in ``section``, positive to the left. The lanes follow their lines. Kerbs,
+            medians and the outermost edges of the lanes stay.
     """
 
     index: int
@@ -203,13 +213,13 @@ class Road:
     def band_with_mouths(self, right_m: float, left_m: float) -> Array:
         """Outline of the whole road between two offsets in metres, anticlockwise. (n, 2)
 
-        At both ends of the road, the outline also has a vertex at each entry of ``all_offsets``
-        between the two offsets. The outlines of the junctions have vertices at these points, too,
-        so that no gap is left.
+        At both ends of the road, the outline also has a vertex at each entry of
+        ``section.all_offsets`` between the two offsets. The outlines of the junctions have vertices
+        at these points, too, so that no gap is left.
         """
         start_points = []
         end_points = []
-        for offset_m in self.section.all_offsets:
+        for offset_m in self.section.all_offsets:  # from right to left
             if right_m < offset_m < left_m:
                 line = self.line(offset_m)
                 start_points.append(line[0])
@@ -223,8 +233,8 @@ class Road:
     def direction(self, at_m: float) -> float:
         """Heading of the centre line at an arc length, in radians anticlockwise from +x."""
         # The interpolated tangent is shorter than 1 in a bend, but only its direction is used.
-        step = interpolate(tangents(self.center), self._lengths, at=np.array([at_m]))[0]
-        return float(np.arctan2(step[1], step[0]))
+        tangent = interpolate(tangents(self.center), self._lengths, at=np.array([at_m]))[0]
+        return float(np.arctan2(tangent[1], tangent[0]))
 
     def point(self, at_m: float, offset_m: float) -> Array:
         """Point at an arc length and an offset, in metres. (2,)"""
@@ -239,20 +249,20 @@ class Road:
 
     @property
     def forward_edges(self) -> list[float]:
-        """Offsets of the edges of the forward lanes in metres, from the centre to the kerb."""
+        """Offsets of the forward lanes' edges in metres, with ``shift_m``, the innermost first."""
         return self._shift_edges(self.section.forward_edges)
 
     @property
     def backward_edges(self) -> list[float]:
-        """Offsets of the edges of the backward lanes in metres, from the centre to the kerb."""
+        """Offsets of the backward lanes' edges in metres, with ``shift_m``, the innermost first."""
         return self._shift_edges(self.section.backward_edges)
 
     def _shift_edges(self, edges: list[float]) -> list[float]:
         """Shift the edges that are painted lines between two lanes."""
         if self.shift_m == 0:
             return edges
-        # Edges go from the centre to the kerb. The first one is a line between two lanes only if
-        # the road has a centre line, and the last one never is.
+        # The first, innermost edge is a line between two lanes only if the road has a centre line.
+        # The last, outermost edge never is.
         first = 0 if self.has_center_line else 1
         last = len(edges) - 1
         shifted = []
@@ -297,17 +307,18 @@ class Road:
         return lanes
 
     def add_crossing(self, start_m: float, depth_m: float, at_start: bool, stop: bool) -> None:
-        """Add a crossing near one end of the road and end the divider paint before it.
+        """Add a crossing near one end of the road. Divider paint begins or ends beyond it.
 
         Args:
-            start_m: Distance from the end of the road to the crossing, in metres.
+            start_m: Distance in metres between this end of the road and the side of the crossing
+                that is nearer to it. It is an arc length only at the start of the road.
             depth_m: Extent of the crossing along the road, in metres.
-            at_start: Whether the crossing lies at the start of the centre line.
-            stop: Whether to add a stop line before the crossing.
+            at_start: Whether this end is the start of the centre line.
+            stop: Whether to add a stop line before the crossing, for vehicles that drive towards
+                this end.
         """
         # `far_m` (far side of the crossing) and `clear_m` (start of the paint) are distances from
-        # this end of the road. Vehicles that drive towards the start of the road use backward
-        # lanes.
+        # this end, too. Vehicles that drive towards the start of the road use backward lanes.
         far_m = start_m + depth_m
         bare_m = STOP_GAP_M + STOP_LINE_M if stop else _BARE_M
         clear_m = far_m + bare_m

@@ -18,16 +18,18 @@ from gsmap.utils.errors import InputError
 def key_maps() -> tuple[KeyMap, ...]:
     """Key maps of all map models in `METHODS`, the most special first; maps without markers last.
 
-    A marker is a prefix of a key by which a model is recognised. A special model builds on others,
-    and its checkpoints contain their markers, too. It must therefore be tried before them. The maps
-    of a model are in ``KEY_MAPS`` of ``gsmap/models/<method>/keys.py``. A model without such a file
+    A marker is a prefix of a key by which a model is recognised. A map without markers has the
+    empty prefix as its default marker, which every key has. A special model builds on others, and
+    its checkpoints contain their markers, too. It must therefore be tried before them. The maps of
+    a model are in ``KEY_MAPS`` of ``gsmap/models/<method>/keys.py``. A model without such a file
     has no published checkpoints.
     """
     num_users: Counter[str] = Counter()  # number of models that build on each model
     for method in METHODS:
         num_users.update(method.built_on)
-    # Models are sorted by the number of models that build on them, so a model comes after all
-    # models that build on it. At equal numbers, the model that is later in METHODS comes first,
+    # `built_on` names all models that a model builds on, also indirectly. If A builds on B, each
+    # model that builds on A is therefore counted for B, too, and so is A. So A has the smaller
+    # number and comes first. At equal numbers, the model that is later in METHODS comes first,
     # because it is more special.
     methods = sorted(reversed(METHODS), key=lambda method: num_users[method.name])
     maps: list[KeyMap] = []
@@ -35,13 +37,15 @@ def key_maps() -> tuple[KeyMap, ...]:
         module = f"gsmap.models.{method.name}.keys"
         if find_spec(module) is not None:
             maps += import_module(module).KEY_MAPS
-    # False sorts before True. Maps with an equal key keep their order.
+    # False sorts before True, so maps without markers come last. The sort is stable: within both
+    # groups, the order of the models is kept.
     return tuple(sorted(maps, key=_has_default_markers))
 
 
 def _has_default_markers(key_map: KeyMap) -> bool:
     """Whether a key map has no markers and so matches the keys of every model."""
-    # The attribute of the class is the default value of the field.
+    # The default is one marker with empty prefixes. The attribute of the class is the default value
+    # of the field.
     return key_map.markers == KeyMap.markers
 
 
@@ -68,5 +72,6 @@ def find_key_map(keys: Iterable[str]) -> KeyMap:
     for key_map in key_maps():
         if key_map.is_marked(keys, upstream=upstream):
             return key_map
-    # The last maps have no markers and match any key, so there are no keys.
+    # The last maps have only the empty prefix as a marker. It is a prefix of any key, so there are
+    # no keys.
     raise InputError("the checkpoint holds no weights.")

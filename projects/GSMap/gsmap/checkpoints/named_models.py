@@ -1,7 +1,7 @@
 """Trained models by name: models that ship in ``models/``, and official models of other systems.
 
 ``models/registry.json`` lists them. The weights of a model are in ``models/NAME.pth``. Weights of
-official models do not ship: users fetch them and save them there.
+official models do not ship: users download them to this path.
 """
 
 import difflib
@@ -166,6 +166,7 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
         ValueError: If ``checkpoint`` is None and ``config`` refers to a config, but not to a model;
             or if the digest of a model's file differs from the registry.
     """
+    # One name may refer to a config and to a model. Then the checkpoint of the model is taken.
     if checkpoint is not None:
         return find_checkpoint(checkpoint)
     is_config = str(config) in named_configs() or Path(config).is_file()
@@ -198,7 +199,7 @@ def _find_model(
         shipped_names = ", ".join(model.name for model in models.values() if not model.address)
         hint = f"the shipped models are {shipped_names}"
         if close_names:
-            hint = f"did you mean {close_names[0]}?"
+            hint = f"did you mean {close_names[0]}?"  # it replaces the list of models
         raise FileNotFoundError(
             f"There is no {kind} {name}, and no model of that name ({hint}){message_end}."
         )

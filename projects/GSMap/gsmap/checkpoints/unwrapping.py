@@ -18,12 +18,17 @@ _PARALLEL_PREFIX = "module."  # of parallel training; removed only at the start 
 _WRAPPER_PARTS = ("_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module")
 _AVERAGED = "ema_"  # prefix of keys of exponential moving averages of weights
 _MAX_KEYS_SHOWN = 8  # largest number of keys in a message
-_MOST_REPEATED = 4  # largest ratio of the bytes of all weights to the stored bytes
+# Largest ratio of the bytes of all weights to the stored bytes. It exceeds 1, because weights that
+# modules share are stored once.
+_MOST_REPEATED = 4
 _SPARE_BYTES = 1 << 26  # number of bytes (64 MiB) that may be repeated in addition
 
 
 class UnfitError(InputError):
-    """Error of a checkpoint without usable weights. Its message follows the name of the file."""
+    """Error of a checkpoint without usable weights.
+
+    The message begins with a verb, because the reader of the file puts the file's name before it.
+    """
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class Unwrapped:
         state: Weights by the keys of the model.
         holder: Contents of the file, if the weights are only a part of them; None for a bare state
             dict.
-        left_out: Number of unused entries by their kind.
+        left_out: Number of unused entries, by a text that names their kind.
     """
 
     state: dict[str, Tensor]
@@ -45,20 +50,25 @@ class Unwrapped:
 def unwrap(content: Any) -> Unwrapped:
     """Find the weights in the contents of a checkpoint, and remove wrappers from their keys.
 
-    A wrapper is a dictionary that contains the state dict under one of its keys, or a module around
-    the model that adds a part to every key. The weights are under the first key of ``WRAPPERS``
-    that leads to a state dict, to a depth of three. Without such a key, they are the contents
-    themselves, or the only entry that is a state dict. Parts of keys from parallel training, from
-    compiled modules and from modules around the model are removed. Averages next to the averaged
-    weights, counters and entries other than tensors are left out.
+    There are two kinds of wrappers: dictionaries that contain the state dict under one of their
+    keys, and modules around the model or its submodules, which add parts to keys. The weights are
+    under the first key of ``WRAPPERS`` that leads to a state dict. Up to three dictionaries may be
+    nested around it. A dictionary without such a key is the state dict itself, if it has tensors
+    and no nested dictionary. Otherwise its only entry that is a state dict with a dot in a key is
+    taken.
+
+    From the keys, the function removes the parts of parallel and sharded training, of compiled
+    modules, of activation checkpoints, and of modules around the model. It leaves out entries
+    that are no tensors, single numbers such as the epoch (counters), and moving averages of weights
+    that are in the state dict, too.
 
     Args:
         content: Contents of the file.
 
     Raises:
-        UnfitError: If there are no weights, or two weights under one key (the message contains the
-            keys); if a tensor is sparse, quantized or without values; or if tensors repeat far
-            fewer stored bytes.
+        UnfitError: If there are no weights (the message lists the keys); if two weights have one
+            key without their wrappers; if a tensor is sparse, quantized or without values; or if
+            the tensors have far more bytes than the file stores, as expanded tensors do.
     """
     entries = _find_state(content, depth=0)
     if entries is None:
@@ -111,12 +121,12 @@ def _select_tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:
 def _describe_contents(content: Any) -> str:
     """Message about contents without weights."""
     if not isinstance(content, Mapping):
-        keys = f"is a {type(content).__name__}"
+        finding = f"is a {type(content).__name__}"
     else:
         names = [key for key in content if isinstance(key, str)]
-        keys = f"has the keys {names[:_MAX_KEYS_SHOWN]!r:.300}" if names else "has no key"
+        finding = f"has the keys {names[:_MAX_KEYS_SHOWN]!r:.300}" if names else "has no key"
     return (
-        f"holds no state dict of tensors: it {keys}, and weights must be its entries or "
+        f"holds no state dict of tensors: it {finding}, and weights must be its entries or "
         f"be under {', '.join(WRAPPERS)}: give a training checkpoint"
     )
 
@@ -137,8 +147,8 @@ def _find_state(content: Any, depth: int) -> Mapping[str, Any] | None:
                 return state
     if _is_state(content):
         return content
-    # Entries under unknown keys. A state dict without dotted keys could be any dictionary of
-    # tensors.
+    # Last, state dicts under unknown keys. Here a dot in a key is required, because a dictionary of
+    # tensors without dots in its keys may be something other than weights.
     states: list[Mapping[str, Any]] = []
     for value in content.values():
         if _is_state(value) and _has_dotted_key(value):
@@ -147,7 +157,7 @@ def _find_state(content: Any, depth: int) -> Mapping[str, Any] | None:
 
 
 def _is_state(value: Any) -> bool:
-    """Whether a value is a mapping from strings with a tensor and without nested mappings."""
+    """Whether a value is a mapping with string keys alone, with tensors and no nested mappings."""
     if not isinstance(value, Mapping):
         return False
     has_tensor = False
@@ -159,7 +169,7 @@ def _is_state(value: Any) -> bool:
 
 
 def _has_dotted_key(state: Mapping[str, Any]) -> bool:
-    """Whether a key contains a dot, as the keys of a model's submodules do."""
+    """Whether any key contains a dot, as the keys of a model's submodules do."""
     return any("." in key for key in state)
 
 

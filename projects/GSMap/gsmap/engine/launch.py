@@ -79,14 +79,15 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         cfg = Config(config.to_dict())
     else:
         path = find_config(config)
+        # `reading_config` names the config, or the part of it, in the message of an error.
         with reading_config(path):
             cfg = Config.fromfile(path, import_custom_modules=False)
-    # `reading_config` names the config, or the part of it, in the message of an error.
     options = dict(cfg_options or {})
     factor = options.pop("image_scale", None)
     for name in options:
         _check_effect(cfg, name=name)
-    # Refuses, for example, a number in place of a dictionary.
+    # Raises an error if an override has another kind of value than the setting, for example a
+    # number in place of a dictionary.
     check_kinds(cfg.to_dict(), overrides=options, source=cfg.filename or "the config")
     with reading_config(f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(options)
@@ -130,7 +131,7 @@ def _fit_loaders(cfg: Config) -> None:
         if not loader:
             continue
         if loader.get("num_workers") == "cores":
-            # torchrun sets the number of processes on this machine.
+            # torchrun sets the number of processes on this machine, which share the cores.
             processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
             cores = len(os.sched_getaffinity(0)) // processes
             loader.num_workers = min(max(cores, 1), _MAX_WORKERS)
@@ -151,8 +152,12 @@ def _fit_loaders(cfg: Config) -> None:
 def load_config(args: argparse.Namespace) -> Config:
     """Read the config of a command, apply the command-line options, and check the result.
 
-    Template values (``_name``) are removed, so that logs and dumped configs show only settings with
-    an effect. Without a GPU, several processes communicate through gloo, independent of the config.
+    Top-level keys ``_name``, which configs copy into other sections, are removed. So logs and
+    dumped configs show only settings with an effect.
+
+    With the launcher ``pytorch``, the process ends when the launcher ends. Without a GPU, this
+    function then also opens the process group, so that the processes communicate through gloo,
+    independent of the config.
 
     Args:
         args: Parsed arguments; ``config`` and the options of `add_common_arguments` are used.
@@ -161,7 +166,8 @@ def load_config(args: argparse.Namespace) -> Config:
         FileNotFoundError: If there is no such file or model.
         ValueError: As in `read_config` and `check_config`.
     """
-    # mmengine reads the number of this process on its machine from the environment.
+    # mmengine reads the number of this process on its machine from the environment. A number that
+    # is set there already is kept.
     os.environ.setdefault("LOCAL_RANK", str(args.local_rank))
     cfg = read_config(args.config, cfg_options=args.cfg_options)
     cfg.launcher = args.launcher
@@ -170,13 +176,14 @@ def load_config(args: argparse.Namespace) -> Config:
     elif cfg.get("work_dir") is None:
         cfg.work_dir = str(Path("work_dirs") / Path(args.config).stem)
     check_config(cfg)
-    for name in list(cfg):
+    for name in list(cfg):  # a list, because the config loses keys in the loop
         if name.startswith("_"):
             cfg.pop(name)
     if args.launcher == "pytorch":
         # torchrun cannot stop its ranks (processes of the run) if it is killed with SIGKILL. So
-        # each rank asks Linux to kill it when the launcher ends. The environment variable with the
-        # name LAUNCHER has the launcher's process id; by default, the parent is the launcher.
+        # each rank asks Linux to kill it when the launcher ends. The constant LAUNCHER is the name
+        # of an environment variable with the launcher's process id. Without the variable, the
+        # parent is the launcher.
         launcher_process = int(os.environ.pop(LAUNCHER, os.getppid()))
         die_with_parent(launcher_process)
     if args.launcher == "pytorch" and not torch.cuda.is_available():
@@ -210,7 +217,10 @@ def rank_timeout_s(cfg: Config) -> float:
 def newest_checkpoint(
     work_dir: str | Path, read: Callable[[Path], object] | None = None
 ) -> Path | None:
-    """Find the newest valid checkpoint of a run; log a warning for each invalid one.
+    """Find the newest valid checkpoint of a run.
+
+    A checkpoint is valid if it is undamaged and ``read`` accepts it. A warning is logged for each
+    invalid checkpoint that is newer than the result.
 
     Args:
         work_dir: Folder of the run.
@@ -226,6 +236,7 @@ def newest_checkpoint(
         match = re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name)
         if match:
             numbers[path] = int(match[1])
+    # A run counts either epochs or iterations, so its numbers can be compared.
     newest_first = sorted(numbers, key=numbers.__getitem__, reverse=True)
     for path in newest_first:
         reason = f"{path} is damaged and is passed over."
@@ -241,7 +252,10 @@ def newest_checkpoint(
 
 
 def _is_undamaged_zip(path: Path) -> bool:
-    """Whether a file is a zip archive whose members have the right checksums."""
+    """Whether a file is a zip archive whose members have the right checksums.
+
+    PyTorch writes checkpoints as zip archives.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             return archive.testzip() is None  # it returns the name of the first damaged member
@@ -257,13 +271,14 @@ def check_config(cfg: Config) -> None:
     """Check the values of a config for mistakes that mmengine accepts without an error.
 
     Raises:
-        ValueError: If a learning-rate schedule and the training end at different epochs, if the
-            training has no epoch, if a setting of a loop has a wrong type, if the optimizer, runner
-            or backend does not exist, if the pipeline lacks a transform that the head needs or its
-            settings contradict the head, if a loader does not keep the frame order that a temporal
-            model needs, or if its batch size is not the number of streams.
+        ValueError: If one of these mistakes is found. The learning-rate schedule and the training
+            end at different epochs. The training has no epoch, or a setting of a loop has a wrong
+            type. The optimizer, runner or backend does not exist. The pipeline lacks a transform
+            that the head needs, or settings of this transform contradict the head. The sampler of a
+            temporal model does not keep the order of frames, or the batch size of its training is
+            not the number of streams.
     """
-    check_targets(cfg)
+    check_targets(cfg)  # transforms that compute the targets of the head
     _check_lengths(cfg)
     _check_backend(cfg)
     _check_streams(cfg)
@@ -311,7 +326,10 @@ def _check_backend(cfg: Config) -> None:
 
 
 def _check_schedule(cfg: Config) -> None:
-    """Require that a cosine schedule and the training end at an equal epoch."""
+    """Require that a cosine schedule and the training end at an equal epoch.
+
+    ``T_max`` is the last epoch of a cosine schedule.
+    """
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     if end is None:
         return
@@ -338,7 +356,8 @@ def _check_registered(cfg: Config, component: str, registry: Registry, type_name
         ValueError: If the registry has no such class.
     """
     if isinstance(type_name, str) and registry.get(type_name) is None:
-        # "; did you mean ...?", or an empty text without a similar name
+        # The text "; did you mean ...?", or an empty text if no name is similar. A full stop then
+        # ends the message.
         hint = suggestion(type_name, names=registry_names(registry)) or "."
         raise InputError(f"{cfg.filename}: there is no {component} of type {type_name!r}{hint}")
 
@@ -346,13 +365,20 @@ def _check_registered(cfg: Config, component: str, registry: Registry, type_name
 def _check_effect(cfg: Config, name: str) -> None:
     """Refuse an override of a template value, because the settings in use are copies of it.
 
-    Template values are the keys ``_name`` and `_COPIED_KEYS`. The error names the copies that the
-    user can override in place of the template value.
+    Template values are the top-level keys ``_name`` and `_COPIED_KEYS`. The error names the copies
+    that the user can override in place of the template value.
+
+    Args:
+        cfg: Config before the override.
+        name: Dotted name of the override.
+
+    Raises:
+        ValueError: If the override changes a template value.
     """
     top, *keys = name.split(".")
     if not (top.startswith("_") or top in _COPIED_KEYS):
         return
-    value: Any = cfg.get(top)
+    value: Any = cfg.get(top)  # becomes the value of the name, None if there is none
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
     # A copy of _name is expected in a setting of that name without the underscore.
@@ -432,7 +458,8 @@ def _check_streams(cfg: Config) -> None:
         loader = cfg.get(f"{split}_dataloader") or {}
         sampler = loader.get("sampler") or {}
         kind = sampler.get("type")
-        # An unknown type counts as `object`, whose name is not the needed one.
+        # For an unknown type, `class_of_type` returns None. `object` then takes its place, whose
+        # name is not the needed one.
         sampler_class = class_of_type(kind, registry=DATA_SAMPLERS) or object
         # Subclasses of the needed sampler are allowed.
         class_names = {base.__name__ for base in sampler_class.__mro__}

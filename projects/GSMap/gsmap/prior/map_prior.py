@@ -26,8 +26,8 @@ from gsmap.utils.files import atomic_write
 
 MEMORY_BYTES = 100 << 20
 """Default of ``memory_bytes``, the largest total size of the tiles in memory."""
-# Largest number of the prior's cells in a quarter of the square around a frame. `_window` checks
-# it.
+# Limit of the extent of a frame: a square with a side from the frame's origin to its farthest edge
+# may have this number of the prior's cells. `_window` checks it.
 _MOST_CELLS = 1 << 24
 
 
@@ -38,15 +38,17 @@ class MapPrior:
     the tiles need more than ``memory_bytes``, the least recently used ones are moved from memory to
     a temporary file. All methods may be called from several threads.
 
-    `read` and `write` use the cell of the prior in which the centre of a cell of the frame lies.
-    For a centre (x, y) in the global frame, this cell has the index floor(x / cell_m) along x and
+    A frame has a grid with cells of any size. `read` and `write` use, for each cell of the grid,
+    the cell of the prior in which the centre of the grid's cell lies. For a centre (x, y) in the
+    global frame, the cell of the prior has the index floor(x / cell_m) along x and
     floor(y / cell_m) along y. Only the position and the yaw of a pose are used, as in
     `MapElements.to_frame`.
 
     Args:
         settings: Classes, place (name of the global frame), cells and tiles.
-        rule: Rule of writing; `HitMissCounts` by default. `LastSeen` and `KeepMaximum` are the
-            rules of HRMapNet (arXiv 2409.00620).
+        rule: Rule of writing: it updates the stored numbers of a cell by a prediction, and converts
+            them to the value that `read` returns. By default, `HitMissCounts`. `LastSeen` and
+            `KeepMaximum` are the rules of HRMapNet (arXiv 2409.00620).
         memory_bytes: Largest total size of the tiles in memory. A tile of three classes takes
             120 kB, or 240 kB with `HitMissCounts`.
     """
@@ -95,6 +97,7 @@ class MapPrior:
                 process.
         """
         path = Path(path)
+        # Open lock file of the reservation.
         owner = reserve_file(path) if update else None
         # After an error, the file is closed and its reservation ends.
         try:
@@ -126,13 +129,14 @@ class MapPrior:
         Raises:
             RuntimeError: If the file is reserved by another process, or by another prior in this
                 process.
-            ValueError: If another program has written the lock file beside it.
+            ValueError: If another program has written the lock file beside it, the file by which
+                processes reserve ``path``.
         """
         path = Path(path)
         with self._lock:
             # A file that `load` has reserved for this prior must not be reserved a second time.
-            owns_file = self._owned_path == path.resolve()
-            owner = None if owns_file else reserve_file(path)
+            is_reserved = self._owned_path == path.resolve()
+            owner = None if is_reserved else reserve_file(path)
             try:
                 with atomic_write(path, mode="wb") as file:
                     write_tiles(
@@ -141,7 +145,8 @@ class MapPrior:
                         rule=self.rule,
                         tiles=self._tiles.packed_tiles(),
                     )
-                # From here on, tiles are read from the new file. A device or a pipe cannot be read.
+                # From here on, tiles are read from the new file. If ``path`` is a device file or a
+                # pipe, it cannot be read.
                 if path.is_file():
                     mapped = _map_file(path)
                     _, _, tile_entries = read_header(mapped, path)
@@ -243,9 +248,9 @@ class MapPrior:
         flat_values = prediction.reshape(len(prediction), -1)
         cells = window.cells
         if visible is not None:
-            chosen = np.flatnonzero(in_view)
-            cells = cells[chosen]
-            flat_values = flat_values[:, chosen]
+            indices_in_view = np.flatnonzero(in_view)
+            cells = cells[indices_in_view]
+            flat_values = flat_values[:, indices_in_view]
         # Cells of the prior that are written, and their values.
         touched, largest = _largest_per_cell(cells, flat_values, size=window.height * window.width)
         with self._lock:
@@ -277,14 +282,20 @@ class MapPrior:
             with self._lock:
                 tile = self._tiles.get_to_write(key, empty=self.rule.empty)
                 for channel, mask in enumerate(covered):
-                    # Rules have an axis for the classes: (S states, 1 class, n cells).
+                    # A rule updates states (S, C, n) of n cells. Here C is 1, since the cells
+                    # differ from class to class.
                     states = tile[:, channel, mask][:, None]
                     hits = np.ones(states.shape[1:], dtype=np.float32)
                     updated = self.rule.update(states=states, values=hits)
                     tile[:, channel, mask] = updated[:, 0]
 
     def _window(self, pose: Pose, grid: BEVGrid) -> "_Window":
-        """Find the rectangle of the prior's cells around a frame, and the frame's cells in it."""
+        """Find the rectangle of the prior's cells around a frame, and the frame's cells in it.
+
+        Raises:
+            ValueError: If ``pose`` is no rigid transform or too far from the origin, or the grid is
+                too large.
+        """
         frame = planar_pose(pose)
         cos = frame.cos
         sin = frame.sin
@@ -292,7 +303,8 @@ class MapPrior:
         x = grid.x_range[0] + dx * (np.arange(grid.width) + 0.5)  # (W,)
         y = grid.y_range[0] + dy * (np.arange(grid.height) + 0.5)  # (H,)
         # The grid lies in a square around the origin of the frame, which reaches corner_m to each
-        # side. Each quarter of the square may have _MOST_CELLS cells of the prior.
+        # side. The square consists of four squares of side corner_m, which may each have
+        # _MOST_CELLS cells of the prior.
         corner_m = max(map(abs, (*grid.x_range, *grid.y_range)))
         square_cells = (2 * corner_m / self.settings.cell_m) ** 2
         if not square_cells <= 4 * _MOST_CELLS:  # also refuses NaN
@@ -309,8 +321,8 @@ class MapPrior:
         width = int(columns.max()) - first_column + 1
         height = int(rows.max()) - first_row + 1
         cells = (rows - first_row) * width + (columns - first_column)
-        # Poses and grids are bounded, so the columns and rows of tiles fit into the index of a
-        # file, which stores them as integers.
+        # `planar_pose` limits the position, and the check above limits the extent of the grid. So
+        # the columns and rows of tiles fit into the integers in the index of a file.
         farthest = max(abs(first_column), abs(first_row)) + max(width, height)
         assert farthest < FARTHEST_TILE * self.settings.tile_cells
         return _Window(
@@ -322,7 +334,10 @@ class MapPrior:
         )
 
     def _load_canvas(self, window: "_Window") -> States:
-        """Copy the tiles of a window to one raster; tiles may be missing. (S, C, height, width)"""
+        """Copy the tiles of a window to one raster (canvas). (S, C, height, width)
+
+        Where a tile is missing, the canvas has the empty state of the rule.
+        """
         num_states, num_classes = self._tiles.shape[:2]
         shape = (num_states, num_classes, window.height, window.width)
         canvas = np.full(shape, self.rule.empty, dtype=np.uint8)
@@ -335,7 +350,7 @@ class MapPrior:
         return canvas
 
     def _store_canvas(self, window: "_Window", canvas: States, touched: NDArray[np.int64]) -> None:
-        """Copy a raster back to those tiles in which at least one cell was touched."""
+        """Copy a canvas back to the tiles in which at least one cell was touched (written)."""
         is_touched = np.zeros(window.height * window.width, dtype=np.bool_)
         is_touched[touched] = True
         is_touched = is_touched.reshape(window.height, window.width)
@@ -375,7 +390,8 @@ class _Window:
         first_row: Smallest row, counted in this way.
         width: Number of columns.
         height: Number of rows.
-        cells: Index of each cell of the frame in the rectangle, row by row. (H * W,)
+        cells: Cell of the prior for each cell of the frame, in the order of the frame's rows. It is
+            an index into the rectangle, whose cells are counted row by row. (H * W,)
     """
 
     first_column: int
@@ -442,7 +458,8 @@ def _largest_per_cell(
     is_touched = np.zeros(size, dtype=np.bool_)
     is_touched[cells] = True
     touched = np.flatnonzero(is_touched)
-    # Values are >= 0, so the zeros do not change a maximum.
+    # Maximum for all cells of the window. Values are >= 0, so the zeros do not change a maximum.
+    # `scatter_reduce_` of torch takes the maximum of all values that have one index.
     largest = torch.zeros(len(values), size)
     index = torch.from_numpy(cells)
     for channel, channel_values in zip(largest, values, strict=True):

@@ -21,6 +21,7 @@ It is far from all points in metres, so an unused row is never the nearest one.
 def _check_polyline(points: Points, num_points: int = 2) -> Points:
     """Check a polyline (n, D) and the number of points to resample, and convert it to float64."""
     points = np.asarray(points)
+    # The message names the usual numbers of coordinates, but more than three are accepted.
     if points.ndim != 2 or len(points) < 2 or points.shape[1] < 2:
         raise InputError(f"points must have shape (n >= 2, 2 or 3), got {points.shape}.")
     if num_points < 2:
@@ -75,12 +76,12 @@ def pad_lines(
     length: int | None = None,
     mode: Literal["constant", "edge"] = "edge",
 ) -> NDArray[Any]:
-    """Stack lines of different lengths and pad the shorter ones at their end.
+    """Stack lines with different numbers of points and pad the shorter ones at their end.
 
     Args:
         lines: Points of each line, at least one point per line. K x (n, D)
-        length: Number P of points, at least the length of the longest line; None for the length of
-            the longest line, or 2 without lines.
+        length: Number P of points of each padded line, at least the largest number n of points of a
+            line; None for this number, or 2 without lines.
         mode: Padding: ``"edge"`` repeats the last point, ``"constant"`` is zero.
 
     Returns:
@@ -161,7 +162,7 @@ def resample_all(
     resampled = np.zeros((len(counts), num_points, points.shape[1]))
     if not counts.any():
         return resampled
-    # All polylines get the length n of the longest: the last vertex is repeated. `indices` counts
+    # All polylines get n vertices, the largest number: the last vertex is repeated. `indices` are
     # the vertices within a polyline, and `rows` are the corresponding rows of `points`. (N, n)
     indices = np.minimum(np.arange(counts.max()), counts[:, None] - 1)
     rows = indices + offsets[:-1, None]
@@ -183,17 +184,18 @@ def resample_all(
 def equivalent_orders(
     points: Points, num_points: int, rng: np.random.Generator | None = None
 ) -> NDArray[np.float64]:
-    """Compute the point orders that describe one map element ("v2" of MapTR).
+    """Compute the point orders that describe one map element (shift pattern "v2" in MapTR's code).
 
     An open polyline has two orders: forward and reversed. A ring, whose last vertex equals its
     first, has n - 1 different vertices and one order for each of them. The order starts at the
-    vertex and keeps the direction of the ring. Order k starts k vertices before the first one. If
-    there are more than S = max(P - 1, 2) vertices, S of them are selected.
+    vertex and keeps the direction of the ring. Order k starts k vertices before the first vertex.
+    If a ring has more than S = max(P - 1, 2) different vertices, only S of these orders are
+    computed, with evenly spaced or random numbers k.
 
     Args:
         points: Vertices at full resolution, in metres. (n, D)
         num_points: Number P of points of an order, at equal distances in the plane.
-        rng: Generator for a random selection of vertices of a ring; None for an even one.
+        rng: Generator for a random selection of the orders of a ring; None for an even one.
 
     Returns:
         Orders in the first rows; unused rows are ``PADDING``. (S, P, D)
@@ -218,8 +220,8 @@ def equivalent_orders(
         rolls = rng.choice(count, num_rows, replace=False)
     twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
     along = arc_lengths(twice)
-    # Distance along the ring of the first vertex of each order. As a ring has no beginning, `rolls`
-    # vertices before vertex 0 is vertex count - rolls.
+    # Distance from vertex 0 to the start of each order, in the direction of the ring. The vertex r
+    # places before vertex 0 is vertex count - r, or vertex 0 itself for r = 0.
     starts = along[-rolls % count, None]
     # The length of one lap is `along[count]`.
     distances = starts + np.linspace(0.0, along[count], num_points)
@@ -239,8 +241,8 @@ def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
         closed: Whether the line is closed.
 
     Returns:
-        Orders in the first rows, of a closed line all forward orders first; unused rows are
-        ``PADDING``. (2 (P - 1), P, D)
+        Orders in the first rows. For a closed line, the forward orders precede the reversed ones,
+        and all rows are used. Unused rows are ``PADDING``. (2 (P - 1), P, D)
     """
     orders = np.full((2 * (len(points) - 1), *points.shape), PADDING)
     if not closed:
@@ -256,12 +258,13 @@ def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
 
 
 def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int64]:
-    """Reorder the points of lines so that the path through them is short (2-opt, Croes 1958).
+    """Reorder the points of lines to shorten the path through them (2-opt, Croes 1958).
 
     In each round, the run of points whose reversal shortens the line most is reversed. The rounds
     end when no reversal shortens the line by more than ``least_gain_m``. This straightens a line
-    that runs back and forth. If the ends of a line are closer than its mean step, so that it is
-    nearly a ring, its first and last points keep their places.
+    that runs back and forth, but the result is not always the shortest path of all orders. If the
+    ends of a line are closer than its mean step, so that it is nearly a ring, its first and last
+    points keep their places.
 
     Args:
         lines: Points of each line in metres; lengths are measured in the plane. (M, P, 2 or 3)
@@ -272,7 +275,8 @@ def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int
     """
     lines = np.asarray(lines, np.float64)[..., :2]
     count, size = lines.shape[:2]
-    # Distances between all pairs of points of a line, (M, P, P).
+    # Distances between all pairs of points of a line, (M, P, P). They are computed once; the rounds
+    # only reorder them.
     apart = np.linalg.norm(lines[:, :, None] - lines[:, None], axis=-1)
     steps = np.linalg.norm(np.diff(lines, axis=1), axis=-1)
     is_ring = apart[:, 0, -1] < steps.mean(1) if size > 1 else np.zeros(count, bool)
@@ -289,7 +293,7 @@ def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int
         step = paths.diagonal(1, 1, 2)  # to place i from the place before it, (m, P + 1)
         # A reversal of the points i to j replaces the steps to point i and from point j by the
         # steps from the point before i to j, and from i to the point after j.
-        replaced = step[:, :-1, None] + step[:, None, 1:]
+        replaced = step[:, :-1, None] + step[:, None, 1:]  # (m, P, P), for places i and j
         before_i_to_j = paths[:, :-2, 1:-1]
         i_to_after_j = paths[:, 1:-1, 2:]
         gain = replaced - before_i_to_j - i_to_after_j
@@ -299,7 +303,7 @@ def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int
         gain = np.triu(gain, 1).reshape(len(active), -1)
         best = gain.argmax(1)  # flat index i * P + j
         improves = gain[np.arange(len(active)), best] > least_gain_m
-        active = active[improves]
+        active = active[improves]  # a line without an improvement is finished
         first, last = np.divmod(best[improves, None], size)  # places i and j
         # The place from which each place gets its point: first + last - place in the reversed run.
         inside = (places >= first) & (places <= last)
@@ -336,9 +340,10 @@ def clip_to_box(
 ) -> list[NDArray[np.float64]]:
     """Compute the pieces of a polyline in an axis-aligned rectangle (Liang and Barsky, 1984).
 
-    Pieces keep the direction of the polyline, and further coordinates are interpolated. A ring is
-    cut into open pieces; its arbitrary start does not end a piece. Pieces that only touch the
-    rectangle are left out.
+    Pieces keep the direction of the polyline, and further coordinates are interpolated. A ring
+    that leaves the rectangle is cut into open pieces; its arbitrary start does not end a piece. A
+    ring inside the rectangle stays one closed piece. Pieces that only touch the rectangle are left
+    out.
 
     Args:
         points: Vertices in metres. (n, D)
@@ -362,13 +367,15 @@ def clip_to_box(
     # y, infinite if it is parallel to an edge.
     with np.errstate(divide="ignore", invalid="ignore"):
         cuts = (edges - start[:, :2]) / step[:, :2]  # (2, n, 2)
-    # A segment on the line of an edge gives 0 / 0. Such an edge does not cut it, so the segment
-    # counts as entering at minus infinity and leaving at infinity.
+    # A segment on the line of an edge gives 0 / 0, which is NaN. Such a segment is inside the range
+    # between this edge and the opposite one. So it gets minus infinity for a lower edge (always
+    # past it) and infinity for an upper edge (never past it).
     along_edge = (step[:, :2] == 0) & np.isnan(cuts)
     cuts = np.where(along_edge, [[[-np.inf]], [[np.inf]]], cuts)
-    # Shares in [0, 1] of a segment at which it enters and leaves the rectangle: it enters where it
-    # has entered both ranges, of x and of y, and leaves where it leaves the first one. A segment
-    # that misses the rectangle has enter >= leave.
+    # Shares in [0, 1] of a segment at which it enters and leaves the rectangle. For each of the
+    # ranges of x and y, the smaller of two cuts is the entry, and the larger one is the exit. The
+    # rectangle is entered at the later entry and left at the earlier exit. A segment that misses
+    # the rectangle has enter >= leave.
     enter = cuts.min(0).max(-1).clip(min=0)
     leave = cuts.max(0).min(-1).clip(max=1)
     hits = np.flatnonzero(enter < leave)
@@ -384,7 +391,7 @@ def clip_to_box(
     limits = [0, *breaks.tolist(), len(hits)]
     pieces = []
     for begin, end in pairwise(limits):
-        # The start of the first segment of the piece, and the ends of all of its segments.
+        # First point of the first segment of the piece, and last points of all its segments.
         piece = np.concatenate([first[begin : begin + 1], last[begin:end]])
         pieces.append(piece)
     starts_inside = hits[0] == 0 and enter[0] == 0

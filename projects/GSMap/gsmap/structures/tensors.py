@@ -26,12 +26,13 @@ def exclude_from_compile(function: Callable[_Params, _Result]) -> Callable[_Para
     The decorator is ``torch.compiler.disable``, applied only once the compiler has been imported,
     since importing it takes a second.
     """
-    # A list instead of functools.cache, about which the compiler warns.
+    # The excluded function, once it has been made. It is kept in a list instead of in
+    # functools.cache, because the compiler warns about functions with such a cache.
     excluded: list[Callable[_Params, _Result]] = []
 
     @functools.wraps(function)
     def wrapper(*args: _Params.args, **kwargs: _Params.kwargs) -> _Result:
-        if "torch._dynamo" not in sys.modules:
+        if "torch._dynamo" not in sys.modules:  # the compiler has not been imported
             return function(*args, **kwargs)
         if not excluded:
             excluded.append(torch.compiler.disable(function))
@@ -57,6 +58,7 @@ def constant(like: Tensor, values: Any, dtype: torch.dtype | None = None) -> Ten
     if _is_traced(like):  # a trace must contain the numbers, not a cached tensor
         return like.new_tensor(values, dtype=dtype)
     key = _hashable(values)
+    # The type is part of the key, because the values depend on it.
     return cached_constant(like, ("values", key, dtype), lambda: like.new_tensor(key, dtype=dtype))
 
 
@@ -64,7 +66,7 @@ def cached_constant(like: Tensor, key: Hashable, make: Callable[[], Tensor]) -> 
     """Return a tensor that depends only on its key, computed at its first use on a device.
 
     The tensor is cached until the process ends, since a captured CUDA graph may read its memory. It
-    is not a buffer of a module, so it is neither copied nor saved with one.
+    is not a buffer of a module, so it is neither copied nor saved with a module.
 
     Args:
         like: Tensor with the device of the result.
@@ -137,6 +139,7 @@ class LateValues:
     """
 
     def __init__(self, values: Tensor) -> None:
+        # On a GPU, the values are complete only when `_arrival` has occurred.
         self._host = values.detach().to("cpu", non_blocking=True)
         self._arrival = None  # event of the GPU at the end of the copy; None on other devices
         if values.is_cuda:
@@ -165,15 +168,19 @@ def _hashable(values: Any) -> Any:
 
 
 def at_least_float32(values: Tensor) -> Tensor:
-    """Convert half precision, which is too coarse for coordinates, to float32; keep other types."""
+    """Convert values to float32, since half precision is too coarse for coordinates.
+
+    Integers and bool become float32, too. A more precise type, such as float64, is kept.
+    """
     return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def in_float32(layer: nn.Module, values: Tensor) -> Tensor:
     """Apply a layer outside of autocast and return its values in float32 or more.
 
-    Half precision has too few digits for neighbouring points. Where two points coincide, the
-    direction of the edge between them, and the gradient of a loss on it, are noise.
+    Half precision has too few digits for neighbouring points, so their rounded coordinates may
+    coincide. The direction of the edge between two such points is noise, and so is the gradient of
+    a loss on the direction.
 
     Args:
         layer: Layer with one input and one output.
@@ -182,6 +189,7 @@ def in_float32(layer: nn.Module, values: Tensor) -> Tensor:
     Returns:
         Output of the layer, at least float32.
     """
+    # Without autocast, the layer takes the values in their type, which is the type of its weights.
     if not torch.is_autocast_enabled(values.device.type):
         return at_least_float32(layer(values))
     with torch.autocast(values.device.type, enabled=False):
@@ -195,10 +203,10 @@ def check_same_shape(**both: Tensor) -> None:
         both: The two tensors. Their keywords are their names in the message.
     """
     # Keyword arguments keep their order.
-    (first_name, first), (name, second) = both.items()
+    (first_name, first), (second_name, second) = both.items()
     if first.shape != second.shape:
         raise InputError(
-            f"{name} must have shape {tuple(first.shape)} of {first_name}, got "
+            f"{second_name} must have shape {tuple(first.shape)} of {first_name}, got "
             f"{tuple(second.shape)}."
         )
 
@@ -207,7 +215,8 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
     """Count the depth bins of a range.
 
     Args:
-        depth_range: Smallest depth, largest depth and size of a bin, in metres.
+        depth_range: Smallest depth, largest depth and size of a bin, in metres. A part of a bin at
+            the end does not count.
 
     Raises:
         ValueError: If the range has no bin.

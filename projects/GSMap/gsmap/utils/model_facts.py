@@ -1,6 +1,7 @@
-"""Keys of checkpoints and result files that describe the model and its calibration.
+"""Keys of checkpoints, result files and metainfo that describe the model and its calibration.
 
-The calibration fits the sigmas of a model, its predicted standard deviations, to the errors.
+The calibration fits the sigmas of a model, its predicted standard deviations, to the errors. The
+metainfo of the training data set is stored in checkpoints.
 """
 
 from collections.abc import Mapping
@@ -23,9 +24,10 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
         meta: Metadata of the checkpoint or the result file; untrusted.
 
     Returns:
-        ``law``, the distribution of the errors, and ``sigmas``, the number n that sets the coverage
-        of the fitted interval of errors: the probability of a normal error within n standard
-        deviations. Empty if there is no calibration.
+        ``law``, the distribution of the errors, and ``sigmas``, a number n. The calibration was
+        fitted so that a central interval of the law contains the expected share of the errors. For
+        any law, this share is the probability of a normal error within n standard deviations, such
+        as 68.3 % for n = 1. Empty if there is no calibration.
 
     Raises:
         ValueError: If the law is unknown, or ``sigmas`` is not a number in (0, 3].
@@ -33,9 +35,11 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
     calibration = meta.get(CALIBRATION)
     if calibration is None:
         return {}
+    # A calibration of a wrong type is treated as one without entries, which raises the error below.
     entries: Mapping[str, Any] = calibration if isinstance(calibration, Mapping) else {}
     law = entries.get("law")
     sigmas = entries.get("sigmas")
+    # In Python, True and False are integers.
     is_number = isinstance(sigmas, int | float) and not isinstance(sigmas, bool)
     if law not in LAW_NAMES or not is_number or not 0 < sigmas <= 3:
         raise InputError(
@@ -46,5 +50,12 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def law_of(meta: Mapping[str, Any]) -> str:
-    """Return the distribution of the errors that the sigmas describe, by default the normal one."""
+    """Return the distribution of the errors that the sigmas describe, by default the normal one.
+
+    Args:
+        meta: Metadata of a checkpoint or a result file; untrusted.
+
+    Raises:
+        ValueError: If the calibration is not valid.
+    """
     return str(calibration_of(meta).get("law", LAW_NAMES[0]))

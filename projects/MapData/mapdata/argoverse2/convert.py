@@ -50,9 +50,12 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
         Counts of the samples and map elements in the file, and of the problems.
 
     Raises:
-        FileNotFoundError: If the split or a requested log is missing.
-        RuntimeError: If no sample is left (allowed for a shard), or a worker process dies. In
-            this case, no file is written.
+        FileNotFoundError: If the split, its list or a requested log is missing.
+        ValueError: If the options name two lists of splits, the list is unknown or malformed, it
+            does not contain ``options.split``, it puts a log into two splits, or its logs are
+            missing though it must be complete.
+        RuntimeError: If no sample is left (allowed for a shard), a worker process dies, or a log
+            exceeds the time limit. In these cases, no file is written.
         OSError: If the file cannot be written, for example on a full disk. No partial file remains.
     """
     summary = ConversionSummary(options.classes)
@@ -67,14 +70,15 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     log_dirs = _remove_unfit_logs(log_dirs, options.keep_map_changes, summary=summary)
     # This may depend on the logs of all shards, so it precedes the choice of the shard.
     excluded_times = _excluded_times(log_dirs, options)
-    # The metadata describe all logs, not only the logs of this shard (part for one of several
-    # machines): shards are merged to one file and must have equal metadata.
+    # A shard is the share of one of several machines. The metadata describe the logs of all shards,
+    # because the files of the shards are merged to one file and must have equal metadata.
     meta = _meta(options, log_dirs, identity=identity)
     log_dirs = options.shard.part(log_dirs)
     jobs = [(log_dir, excluded_times.get(log_dir.name, ())) for log_dir in log_dirs]
     convert_log = partial(_try_log, options=options)  # can be sent to worker processes
     offsets_ns: list[int] = []  # time between each sample and its LiDAR sweep
     progress = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
+    # `logs` yields the folders in `log_dirs` and shows the progress.
     with progress as logs, AnnotationWriter(target, meta, shard=options.shard) as writer:
         # Results come in the order of the jobs.
         results = ordered_map(convert_log, jobs, workers=_worker_count(options, log_dirs))
@@ -89,7 +93,7 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
                     sweep_ns = int(Path(sample.lidar.path).stem)  # a file is named by its time
                     offsets_ns.append(abs(sweep_ns - sample.timestamp_ns))
             _add_problems(summary, log_dir.name, result=result)
-        is_whole = not options.shard.count  # a shard may be empty
+        is_whole = not options.shard.count  # 0 without shards; only a shard may be empty
         if not len(writer) and is_whole:
             raise WorkError(f"no sample is left for {target}:\n{summary.text()}")
     note = f"{len(offsets_ns)} of {len(writer)} samples have a LiDAR sweep"
@@ -103,15 +107,15 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
 def _listed_logs(
     split_list: SplitList, options: Argoverse2Options, summary: ConversionSummary
 ) -> list[Path]:
-    """Find the logs of one part of a split list.
+    """Find the logs of one part, such as ``train``, of a split list.
 
     All official folders are searched, since published lists mix logs of ``train``, ``val`` and
     ``test``. If listed logs are missing, a note is added to the summary.
 
     Args:
-        split_list: Names of the logs of each part, such as ``train``.
+        split_list: Names of the logs of each part.
         options: Options of the conversion. ``options.split`` is the name of the part.
-        summary: Summary of the conversion.
+        summary: Summary of the conversion, changed in place.
 
     Returns:
         Folders of the logs, sorted by name. If ``options.logs`` is not empty, only the logs whose
@@ -128,11 +132,13 @@ def _listed_logs(
             f"{', '.join(split_list.scenes)} with --split."
         )
     log_by_name = {log.name: log for log in find_all_logs(options.root)}
-    names = {name: name for name in log_by_name}  # the name of a log is also its token
+    # `resolve_scenes` takes names by token (id in the data set). A log's name is also its token.
+    name_by_token = {name: name for name in log_by_name}
     list_title = options.split_file or f"split {split_list.name!r}"
-    with explain_errors(list_title, "list each log in one split"):
-        # Part of each log that the list names, and the listed names that the data set lacks.
-        part_by_name, absent = resolve_scenes(split_list.scenes, names)
+    with explain_errors(list_title, remedy="list each log in one split"):
+        # Part of each log that the list names, and the listed names that the data set lacks. A log
+        # in two parts raises an error.
+        part_by_name, absent = resolve_scenes(split_list.scenes, name_by_token)
     listed = set(split_list.scenes[options.split])
     missing = listed.intersection(absent)
     if missing:
@@ -156,7 +162,7 @@ def _listed_logs(
 
 
 def _worker_count(options: Argoverse2Options, log_dirs: Sequence[Path]) -> int:
-    """Number of worker processes: at most one per log, and at least one."""
+    """Number of processes: ``options.workers``, but at most one per log, and at least one."""
     return min(options.workers, max(len(log_dirs), 1))
 
 
@@ -195,7 +201,10 @@ def _try_log(job: tuple[Path, Collection[int]], options: Argoverse2Options) -> L
 
 def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -> None:
     """Count the samples, map elements and polygons of a log that are left out."""
-    # An omission is counted by its reason, with the log or the element as an example.
+    # `add_problem` counts by the reason, with the log or the element as an example. `left_out` and
+    # `invalid` have numbers of samples and of polygons. `elements` has lists of ids of unusable map
+    # elements, by a sentence with the reason. Its full stop is removed, because other reasons have
+    # none.
     for reason, count in result.left_out.items():
         summary.add_problem(f"sample left out: {reason}", log_id, count=count)
     for reason, element_ids in result.elements.items():
@@ -209,7 +218,10 @@ def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -
 def _remove_unfit_logs(
     log_dirs: Sequence[Path], keep_map_changes: bool, summary: ConversionSummary
 ) -> list[Path]:
-    """Remove logs with unusable data and, by default, logs with a changed map, and report both."""
+    """Remove logs with unusable data and, by default, logs with a changed map.
+
+    The summary gets a problem for each removed log, and for each log with a changed map.
+    """
     broken = "its map or sensor data cannot be used (known to fail)"
     changed = "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
     fit_logs = []
@@ -247,15 +259,16 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path], identity: str) -
         "rate_hz": options.rate_hz,
         "compat": options.compat,
     }
-    # The default is not written.
+    # The default is not written, so files with the default keep the metadata of files that were
+    # made before this option existed.
     if options.thin_over != "log":
         choices["thin_over"] = options.thin_over
     choices["num_sweeps"] = options.max_sweeps
     choices[SPLIT_LIST] = identity
     return options.meta(
-        "av2",
-        "ego",
-        options.split,
+        dataset="av2",
+        frame="ego",
+        split=options.split,
         dim=options.dim,
         source_fingerprint=fingerprint(sizes),
         versions={
@@ -270,7 +283,7 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path], identity: str) -
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py av2`` to a parser."""
     add = parser.add_argument
-    add_log_options(parser, "10hz of train, 2.5hz of val and test, as published")
+    add_log_options(parser, usual_rate="10hz of train, 2.5hz of val and test, as published")
     add(
         "--at", default="auto",
         help="times: lidar, cameras, auto (sweeps where there are some, else images) "

@@ -21,8 +21,9 @@ RING_CAMERAS = (
     "ring_front_center", "ring_front_right", "ring_front_left", "ring_rear_right", "ring_rear_left",
     "ring_side_right", "ring_side_left",
 )  # fmt: skip
-# Longest times between a LiDAR sweep and the image of a ring camera, and between a LiDAR sweep and
-# the image of any camera, by the official API.
+# Longest times by which a LiDAR sweep and an image may differ, by the official API. The first limit
+# is for the image of a ring camera that belongs to a sweep. The second one is for the sweep that
+# belongs to an image of any camera.
 MAX_CAMERA_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_RING_CAM_TIMESTAMP_DIFF)  # 25 ms
 MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 51 ms
 
@@ -78,7 +79,7 @@ class Argoverse2Log:
             table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
-            # A rotation has a quaternion of length 1. The comparison is false for NaN, too.
+            # The quaternion of a rotation has the length 1. The comparison is also False for NaN.
             is_valid = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 1e-3
             is_valid &= np.isfinite(translations).all(axis=1)
             num_invalid = int((~is_valid).sum())
@@ -95,10 +96,10 @@ class Argoverse2Log:
     def city(self) -> str:
         """Short name of the city, such as ``PIT``; empty if no map file has a city in its name."""
         map_paths = (self.log_dir / "map").glob("log_map_archive_*____*.json")
-        path = next(map_paths, None)
+        path = next(map_paths, None)  # a log has one map, so the first file suffices
         if path is None:
             return ""
-        suffix = path.name.split("____")[1]  # "PIT_city_47117.json"
+        suffix = path.name.split("____")[1]  # such as "PIT_city_47117.json"
         return suffix.split("_")[0]
 
     @cached_property
@@ -168,8 +169,8 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
         Folders of the logs, sorted.
 
     Raises:
-        FileNotFoundError: If the split is missing or has no log, or one of ``logs`` is the
-            beginning of no id.
+        FileNotFoundError: If the split is missing or has no log, or if no id begins with one of
+            ``logs``.
     """
     folder = _split_folder(root, split)
     if folder is None:
@@ -191,6 +192,9 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
 
 def find_all_logs(root: Path) -> list[Path]:
     """Find the logs of all official splits below a data root.
+
+    Returns:
+        Folders of the logs, sorted within each split.
 
     Raises:
         FileNotFoundError: If there is no log.

@@ -230,8 +230,10 @@ class MatchTable:
 
         The order is the order of `tokens`. The result is empty if the metric has no such IoU.
         """
-        values = np.asarray(self._columns["class_iou"]).reshape(len(self), -1)
-        return values[self._order, label] if values.size else np.zeros(0)
+        values = np.asarray(self._columns["class_iou"])
+        if not values.size:
+            return np.zeros(0)
+        return values.reshape(len(self), -1)[self._order, label]
 
     def detections(self, thresholds: Mapping[str, Sequence[float]]) -> dict[str, ClassDetections]:
         """Rank the predictions of each class over all samples by score.

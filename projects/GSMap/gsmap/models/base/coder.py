@@ -1,4 +1,7 @@
-"""Selection of detections from the class scores and points of all queries."""
+"""Selection of detections from the class scores and points of all queries.
+
+N is the number of queries, and M is the number of detections.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -43,10 +46,10 @@ class MapCoder:
     Args:
         grid: Extent of the map.
         max_num: Largest number of detections per sample, >= 1.
-        margin_m: Largest distance of a point outside of the map, in metres, > 0. None keeps all
-            detections.
-        score_threshold: Detections with this score or a lower one are dropped. None keeps all
-            detections.
+        margin_m: Largest distance of a point outside of the map, in metres, > 0. With None, no
+            detection is dropped because of its points.
+        score_threshold: Detections with this score or a lower one are dropped. With None, no
+            detection is dropped because of its score.
         unfold_classes: Class indices of lines whose points are reordered to a short path
             (`shortest_orders`). This is for models that are trained with losses of masks, which do
             not penalise lines that run back and forth.
@@ -84,7 +87,9 @@ class MapCoder:
         # Without a margin, `keep_mask` does not read the points, so they need not be selected.
         best_pts = pts if self.margin_m is None else pts[best.query_inds]
         is_valid = self.keep_mask(best.scores, best_pts)
-        rows = is_valid.nonzero()[:, 0]  # the only synchronisation with the device
+        # The number of valid detections must be known here, so the host waits for the device. It is
+        # the only such wait in this method.
+        rows = is_valid.nonzero()[:, 0]
         return Detections(
             scores=best.scores[rows], labels=best.labels[rows], query_inds=best.query_inds[rows]
         )
@@ -154,7 +159,7 @@ class MapCoder:
         points = fields["pts"]
         is_line = torch.isin(labels, constant(labels, self.unfold_classes))
         orders = torch.arange(points.shape[1], device=points.device).repeat(len(points), 1)
-        # New order of the points of each line, computed in numpy. (lines, P)
+        # New order of the points of each line, computed in numpy on the host. (lines, P)
         line_orders = shortest_orders(points[is_line].cpu().numpy())
         orders[is_line] = torch.from_numpy(line_orders).to(orders)
         # The new point j of detection i is its previous point ``orders[i, j]``.
@@ -165,8 +170,12 @@ class MapCoder:
 class DetectionHead(BaseModule, NeedsTargets):
     """Base class of map heads, which predict the detections of the last decoder layer.
 
+    A call of a head returns the predictions of each decoder layer, objects with the class logits
+    ``scores`` (B, N, classes) and the ``references`` (B, N, ...). References are the geometry that
+    the queries predict.
+
     Attributes:
-        reference: Decoding of references, the geometry that the queries predict, to points.
+        reference: Decoding of references to points in metres.
         coder: Selection of detections.
         not_exported: Reason why the head has no ONNX export; empty if it has one.
     """
@@ -187,7 +196,15 @@ class DetectionHead(BaseModule, NeedsTargets):
         """
 
     def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
-        """Run the head and decode its detections."""
+        """Run the head and decode its detections.
+
+        Args:
+            bev_outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
+            batch_data_samples: Samples of the batch.
+
+        Returns:
+            Detections of each sample, as in `predict_by_feat`.
+        """
         metas = [sample.metainfo for sample in batch_data_samples]
         return self.predict_by_feat(self(bev_outputs), metas)
 
@@ -195,8 +212,8 @@ class DetectionHead(BaseModule, NeedsTargets):
         """Decode the predictions of the last layer.
 
         Args:
-            outputs: Predictions of each layer.
-            batch_img_metas: Meta dict of each sample.
+            outputs: Predictions of each layer, with ``scores`` and ``references``.
+            batch_img_metas: Meta dict of each sample, for subclasses; not used in this class.
 
         Returns:
             Detections of each sample, highest score first: ``scores_3d`` (M,), ``labels_3d`` (M,),
@@ -204,7 +221,7 @@ class DetectionHead(BaseModule, NeedsTargets):
         """
         last = outputs[-1]
         results = []
-        for scores, references in zip(last.scores, last.references, strict=True):  # samples
+        for scores, references in zip(last.scores, last.references, strict=True):  # each sample
             fields = self.reference.decode(references)
             scores = self.coder.weigh_scores(scores, fields)
             best = self.coder.decode(scores, fields["pts"])
@@ -217,7 +234,7 @@ class DetectionHead(BaseModule, NeedsTargets):
         return results
 
     def select_detections(self, fields: Tensors, best: Detections) -> Tensors:
-        """Select the fields of the detections.
+        """Select the fields of the detections from the fields of all queries.
 
         Args:
             fields: Decoded references, by name. (N, ...) each

@@ -20,22 +20,27 @@ class GaussianGuidance(Guidance, AddsWeights):
     transform the sampling offsets are identities for the initial Gaussians of a decoder
     (`GaussianSpace.frames`).
 
+    A reference is the vector of D entries that the decoder refines for each query. It encodes the
+    Gaussian: the centre mu, the two standard deviations sigma along its axes, and the angle theta
+    of its first axis.
+
     Args:
-        space: Encoding of Gaussians in references; None for references without Gaussians, which
-            raises the error below.
+        space: Encoding of Gaussians in references. References without Gaussians have None, for
+            which a ValueError is raised.
         embed_dims: Channels C.
         sampling: Transform the sampling offsets of deformable attention by the orientation and size
             of each Gaussian.
         embedding: Add an embedding of (mu, sigma, theta) to the positional queries.
-        invariant: Use matrices of the offsets that are equal for theta and theta + pi.
+        invariant: Use matrices of the offsets that are equal for theta and theta + pi, since both
+            angles describe one Gaussian.
         hidden_dims: Hidden channels of the embedding.
 
     Raises:
         ValueError: If the references have no Gaussians.
     """
 
-    # Prefix of the weights that a checkpoint may lack, such as a checkpoint of MapTR. They then
-    # keep their initial values, which have no effect.
+    # Prefix of the weights that may be missing in a checkpoint, for example in a checkpoint of
+    # MapTR. Missing weights keep their initial values, which have no effect.
     neutral_keys = ("embedding.",)
 
     def __init__(
@@ -53,7 +58,8 @@ class GaussianGuidance(Guidance, AddsWeights):
         self.space = space
         self.sampling = sampling
         self.invariant = invariant
-        # The input has the six features of a Gaussian from `GaussianSpace.describe`.
+        # The input has the six features of a Gaussian from `GaussianSpace.describe`: mu (2), sigma
+        # before its activation (2), cosine and sine of 2 theta.
         self.embedding = mlp(6, hidden_dims, embed_dims) if embedding else None
         self.init_weights()
 
@@ -77,7 +83,10 @@ class GaussianGuidance(Guidance, AddsWeights):
         return query_pos + self.embedding(self.space.describe(reference))
 
     def frames(self, reference: Tensor, feats: Tensor) -> Tensor | None:
-        """Matrices that transform sampling offsets to the frame of each Gaussian.
+        """Matrices that turn and stretch sampling offsets with the Gaussian of each query.
+
+        The offsets are given for the initial Gaussian. The matrices transform them by the change of
+        orientation and size from the initial Gaussian to the Gaussian of the query.
 
         Args:
             reference: References. (B, Q, D)
@@ -92,7 +101,7 @@ class GaussianGuidance(Guidance, AddsWeights):
             return None
         finest = feats if isinstance(feats, Tensor) else feats[0]
         height, width = finest.shape[-2:]
-        # Size of a cell of the map in metres. A transform by a Gaussian in metres needs it for
-        # offsets in cells.
+        # Width and height of a cell in metres. Gaussians are in metres, but offsets are in cells,
+        # which need not be square.
         cell_m = self.space.grid.with_size(height, width).pixel_size_m
         return self.space.frames(reference, invariant=self.invariant, cell_m=cell_m)

@@ -1,10 +1,12 @@
 """Memory of Gaussians: transformation to the next frame, refinement, and fusion.
 
-The memory of Gaussians is not in the paper. The published memory of queries propagates points.
+The memory of Gaussians is not in the GSMap paper. The memory of queries that other papers publish
+(`QueryMemory`) propagates points.
 
-A reference encodes a point or a Gaussian as D numbers: the centre, [0, 1] over the map, possibly a
-height, and for a Gaussian two sigmas and the angle theta before their activation. ``decode`` of the
-reference space returns Gaussians in metres, and ``encode`` is its inverse.
+A reference encodes a point or a Gaussian as D numbers. They are the centre, [0, 1] over the map,
+and possibly a height. For a Gaussian, three numbers follow: its two sigmas before their activation,
+and its angle theta from the direction of travel. ``decode`` of the reference space returns
+Gaussians in metres, and ``encode`` is its inverse.
 """
 
 import math
@@ -31,9 +33,11 @@ class GaussianMemory(QueryMemory):
     Args:
         embed_dims: Channels C of the queries.
         covariance: Propagation of the Gaussians. ``"points"`` propagates only the centres, and each
-            query starts with the initial Gaussian. ``"moved"`` transforms the Gaussians with the
-            motion of the vehicle and adds the noise. ``"fused"`` also fuses the refined Gaussians
-            with the transformed Gaussians of equal point index (`fuse_gaussians`).
+            query starts with the sigmas and the angle of the initial Gaussian of a new query.
+            ``"moved"`` transforms the Gaussians with the motion of the vehicle and adds the noise
+            to their covariance. ``"fused"`` also fuses each Gaussian that the decoder has refined
+            with its transformed Gaussian of the previous frame (`fuse_gaussians`). Both belong to
+            one point of a propagated query.
         noise_m: Standard deviation of the drift of a Gaussian after one second, in metres. The
             variance grows linearly with time.
         noise_deg: Standard deviation of the drift of the heading after one second, in degrees.
@@ -92,11 +96,14 @@ class GaussianMemory(QueryMemory):
                 drift_m=self.noise_m * sqrt_seconds,
                 drift_rad=self.noise_rad * sqrt_seconds,
             )
-            # The heights are taken from the second argument.
+            # Gaussians have no height. The second argument supplies the heights, because the base
+            # class has transformed them.
             return space.encode(gaussians, transformed)
 
     def fuse_references(self, refined: Tensor, transformed: Tensor, head: FlowHead) -> Tensor:
-        """Fuse refined Gaussians with the transformed ones, if their centres are on the map.
+        """Fuse refined Gaussians with the transformed ones whose centres are on the map.
+
+        With another ``covariance`` than ``"fused"``, the refined Gaussians are returned.
 
         Args:
             refined: References refined by the decoder. (B, K, P, D)
@@ -112,8 +119,8 @@ class GaussianMemory(QueryMemory):
         with torch.autocast(refined.device.type, enabled=False):
             gaussians = fuse_gaussians(space.decode(transformed), space.decode(refined))
             fused = space.encode(gaussians, refined)  # with the heights of `refined`
-        # `transform_references` has moved centres outside of the map to its border, away from the
-        # element. These are not fused.
+        # `transform_references` has clamped centres outside of the map to its border, away from
+        # their element. These Gaussians are not fused. Their distance from the middle is 0.5.
         distances = (transformed[..., :2] - 0.5).abs()  # distances from the middle of the map
         inside = distances.amax(-1, keepdim=True) < 0.5
         return torch.where(inside, fused, refined)

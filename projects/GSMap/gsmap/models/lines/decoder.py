@@ -17,7 +17,7 @@ class ClassLines(NamedTuple):
     """Predictions of one decoder layer for the lines of one map class.
 
     Attributes:
-        states: States of the points. (B, n, p, C)
+        states: States (features) of the p points of each of n lines. (B, n, p, C)
         logits: Logits of a line and of no line. (B, n, 2)
         masks: Logits of the masks of the lines. (B, n, H, W)
     """
@@ -82,9 +82,11 @@ class AttentionLayer(nn.Module):
 
         Args:
             tokens: Tokens. (B, Q, C)
-            position: Positional encoding of the tokens, added to queries and keys. (B, Q, C)
-            key: Keys of the S vectors of the memory, positional encoding included. (B, S, C)
-            memory: Values of the memory. (B, S, C)
+            position: Positional encoding of the tokens, added to the queries of both attentions and
+                to the keys of the self-attention. (B, Q, C), or (Q, C) for all samples
+            key: Keys of the S vectors of the memory, positional encoding included. None without
+                cross-attention. (B, S, C)
+            memory: Values of the memory. None without cross-attention. (B, S, C)
             masks: ``attn_mask`` or ``key_padding_mask`` of `nn.MultiheadAttention`, True where
                 attention is blocked. They are for the cross-attention, or for the self-attention if
                 there is no memory.
@@ -112,7 +114,7 @@ class PointLineDecoder(BaseModule):
     next layer, the points of a line attend only to the cells of its mask.
 
     Args:
-        queries: Number of lines n, and of points p per line, for every map class.
+        queries: Number of lines n, and of points p per line, as a pair for every map class.
         embed_dims: Channels C.
         num_layers: Number of layers.
         num_heads: Heads of each attention.
@@ -138,7 +140,7 @@ class PointLineDecoder(BaseModule):
         for n, p in queries:
             self.queries.append((int(n), int(p)))
             self.points_per_class.append(int(n) * int(p))
-        total = sum(self.points_per_class)
+        total = sum(self.points_per_class)  # Q
         self.query = nn.Embedding(total, embed_dims)
         self.query_pos = nn.Embedding(total, embed_dims)
         self.level = nn.Embedding(1, embed_dims)  # embedding of the only level of BEV features
@@ -181,6 +183,7 @@ class PointLineDecoder(BaseModule):
         for layer in self.layers:
             mask = None
             if self.line_masks:
+                # `outputs[-1]` has the masks that were predicted before this layer.
                 # nn.MultiheadAttention takes masks (B * heads, Q, S), in which the heads of a
                 # sample are next to each other.
                 mask = self.attention_mask(outputs[-1]).repeat_interleave(self.num_heads, 0)
@@ -192,14 +195,14 @@ class PointLineDecoder(BaseModule):
         """Predict the lines of every class.
 
         Args:
-            states: States of all Q points of all classes. (B, Q, C)
+            states: States of all Q points, sorted by class and then by line. (B, Q, C)
             bev: BEV features. (B, C, H, W)
         """
         states_by_class = self.norm(states).split(self.points_per_class, 1)
         lines = []
         for index, (_, p) in enumerate(self.queries):
             point_states = states_by_class[index].unflatten(1, (-1, p))  # (B, n, p, C)
-            line_states = point_states.flatten(2)
+            line_states = point_states.flatten(2)  # (B, n, p * C)
             logits = self.cls_branches[index](line_states)
             # The mask logit of a cell is the dot product of its features with the line's kernel.
             kernels = self.mask_branches[index](line_states)  # (B, n, C)
@@ -223,5 +226,5 @@ class PointLineDecoder(BaseModule):
             blocked = class_lines.masks.detach().flatten(2) < 0  # (B, n, S)
             is_empty = blocked.all(-1, keepdim=True)
             blocked &= ~is_empty  # for a line with an empty mask, no cell is blocked
-            masks.append(blocked.repeat_interleave(p, 1))
+            masks.append(blocked.repeat_interleave(p, 1))  # one row for each point of a line
         return torch.cat(masks, dim=1)

@@ -27,10 +27,10 @@ class LinePredictions(NamedTuple):
 
     Attributes:
         scores: Logits of the classes, -inf except for the class of the query. N is the number of
-            queries of all classes together. (B, N, classes)
-        references: Points of each line, for `Reference.decode` of the head: coordinates
-            (B, N, P, 2), or coordinates and the logit by which `decode` selects points.
-            (B, N, P, 3)
+            line queries of all classes together. (B, N, classes)
+        references: Points of each line. The ``reference`` of the head decodes them to metres. They
+            are coordinates in [0, 1] over the map (B, N, P, 2), or coordinates and a logit by which
+            the decoding selects points (B, N, P, 3).
         lines: Lines of every class, each a NamedTuple of tensors (B, n, ...) with ``logits`` and
             ``masks``. n is the number of queries of the class.
     """
@@ -43,7 +43,8 @@ class LinePredictions(NamedTuple):
 def class_scores(logits: Sequence[Tensor]) -> Tensor:
     """Class logits of all queries, from the logits of the lines of every class.
 
-    The sigmoid of a class logit is the probability of a line in the softmax of its two logits.
+    A class logit is the logit of a line minus the logit of no line. Its sigmoid is therefore the
+    probability of a line in the softmax of the two logits.
 
     Args:
         logits: Logits of a line and of no line, for every class. (B, n, 2) each
@@ -66,7 +67,8 @@ class LineHead(DetectionHead):
     Args:
         grid: Extent of the map.
         classes: Names of the classes.
-        numbers: Number of line queries of each class.
+        numbers: Number of line queries of each class. Their sum is the largest number of
+            detections. ``decoder`` must contain the queries, too.
         decoder: Settings of `PointLineDecoder`.
         losses: Costs and losses of the lines of one class, and weights of the losses.
         mask_pixel_m: Side of a pixel in metres, in the masks of lines and classes in training and
@@ -81,8 +83,8 @@ class LineHead(DetectionHead):
     Attributes:
         targets: Description of the targets that the transform in the training pipeline makes, for
             error messages. The class attribute ``transforms`` names this transform.
-        level_weights: Weights of the class masks of the BEV levels. With fewer levels, the last
-            weights are used.
+        level_weights: Weights of the class masks of the BEV levels, the BEV features after each
+            layer of the encoder. With fewer levels, the last weights are used.
 
     Raises:
         ValueError: If the decoder has no layer or more than ``LAYER_WEIGHTS``.
@@ -109,6 +111,7 @@ class LineHead(DetectionHead):
         self.grid = grid
         self.classes = tuple(classes)
         self.losses = losses
+        # Rows (along the direction of travel) and columns of the masks.
         self.mask_size = front_size(grid.rasterized(mask_pixel_m))
         self.point_dims = point_dims
         self.decoder = build_part(decoder, type="PointLineDecoder", embed_dims=embed_dims)
@@ -119,12 +122,12 @@ class LineHead(DetectionHead):
                 f"for {len(LAYER_WEIGHTS)} layers, got {num_layers}."
             )
         self.layer_weights = LAYER_WEIGHTS[-num_layers:]
-        # The coder selects detections by their scores. Without `margin_m`, lines are kept however
+        # The coder selects detections by their scores. With `margin_m=None`, lines are kept however
         # far they reach beyond the map.
         self.coder = MapCoder(
             grid, max_num=sum(numbers), margin_m=None, score_threshold=score_threshold
         )
-        self.semantic_branches = nn.ModuleList()
+        self.semantic_branches = nn.ModuleList()  # predict the class masks
         for _ in classes:
             self.semantic_branches.append(nn.Conv2d(embed_dims, 2, kernel_size=1))
         self.coordinates = nn.Sequential(
@@ -134,11 +137,15 @@ class LineHead(DetectionHead):
             nn.ReLU(),
             nn.Conv2d(hidden_dims, point_dims, kernel_size=1),
         )
-        self._cache: tuple[Any, Tensor] | None = None  # versions of the weights, and the feature
+        # Versions of the weights of `coordinates`, and the result of `coordinate_feature` for them.
+        self._cache: tuple[Any, Tensor] | None = None
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
         """Settings of the transform of targets that follow from the settings of the head.
+
+        When a config is read, they are copied to the transform, so that the masks of both have one
+        size.
 
         Args:
             settings: Settings of the head.
@@ -157,10 +164,11 @@ class LineHead(DetectionHead):
         return [self.predictions(layer, mean) for layer in layers]
 
     def predictions(self, layer: Sequence[Any], mean: Tensor) -> LinePredictions:
-        """Lines and scores of one decoder layer.
+        """Lines and scores of one decoder layer. Subclasses implement this method.
 
         Args:
-            layer: Lines of every class (`ClassLines`).
+            layer: Lines of every class from the decoder (`ClassLines`): states of the points,
+                logits and masks.
             mean: Result of `coordinate_feature`. (D,)
         """
         raise NotImplementedError
@@ -168,11 +176,14 @@ class LineHead(DetectionHead):
     def coordinate_feature(self) -> Tensor:
         """Mean over the map of the features of its coordinates, cached in inference. (D,)
 
-        Differs from the paper, as in the released code: the point branches multiply their outputs
-        by this mean instead of the features of single cells.
+        Differs from the papers of PivotNet and BeMapNet, as in their released code: the point
+        branches multiply their outputs by this mean instead of the features of single cells.
         """
+        # In inference, the cached mean is valid while the versions of the weights do not change.
+        # In training, the mean is always computed, and the cache is cleared: fused optimizers
+        # change weights without a new version. Compiled code computes it, too.
         if torch.is_grad_enabled() or torch.compiler.is_compiling():
-            self._cache = None  # fused optimizers change weights without a new version
+            self._cache = None
             return self._mean_feature()
         versions = tensor_versions(self.coordinates)
         if self._cache is None or self._cache[0] != versions:
@@ -194,7 +205,8 @@ class LineHead(DetectionHead):
         """Losses by name, summed over the layers.
 
         Args:
-            bev_outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
+            bev_outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W), and from some
+                encoders ``bev_levels``, the features after each of their layers.
             batch_data_samples: Samples with the targets of the transform.
         """
         outputs = self(bev_outputs)
@@ -203,7 +215,7 @@ class LineHead(DetectionHead):
         with torch.autocast(feats.device.type, enabled=False):
             truths = [self.truth(sample) for sample in batch_data_samples]
             line_losses, _ = self.line_losses(outputs, truths, tokens=tokens)
-            # Some encoders return the BEV features after each of their layers (levels).
+            # Without levels, the BEV features are the only level.
             mask_levels = []
             for level in bev_outputs.get("bev_levels", [feats]):
                 mask_levels.append(self.class_masks(level))
@@ -237,7 +249,11 @@ class LineHead(DetectionHead):
         return instances
 
     def truth(self, sample: Det3DDataSample) -> list[Any]:
-        """Annotated lines of a sample for every class, from its `line_targets`."""
+        """Annotated lines of a sample for every class, from its `line_targets`.
+
+        Subclasses implement this method. The lines of a class are an object with ``masks``
+        (K, H, W), where K is the number of annotated lines.
+        """
         raise NotImplementedError
 
     def cases(self, lines: Any, truths: Sequence[Any], tokens: Sequence[str]) -> Iterator[Case]:
@@ -245,7 +261,7 @@ class LineHead(DetectionHead):
 
         Args:
             lines: Lines of one layer and class, a NamedTuple of tensors (B, n, ...).
-            truths: Annotated lines of the class in each sample.
+            truths: Annotated lines of the class in each sample, K lines.
             tokens: Token of each sample.
         """
         lines = lines._replace(masks=self.resize_masks(lines.masks))
@@ -319,8 +335,9 @@ class LineHead(DetectionHead):
                 groups.append(group)
                 cases.extend(group)
                 weights.append(layer_weight / num_groups)
-        # All cases are matched at once, because each call of `match` waits for the device. It
-        # returns one entry for each case, in their order.
+        # All cases are matched at once, because each call of `match` waits for the device. The
+        # result has the matches of each case, in the order of the cases. The loop below takes the
+        # matches of one group after another from its start.
         remaining_matches = self.losses.match(cases)
         totals: Tensors = {}
         matches = []
@@ -335,7 +352,8 @@ class LineHead(DetectionHead):
     def class_masks(self, bev_feats: Tensor) -> Tensor:
         """Logits of the class masks. (B, C, H, W) -> (B, classes, rows, columns)"""
         front = self.front(bev_feats)
-        # Each class has two channels. The released code trains only the second one.
+        # Each class has two channels, as in the released weights. The released code trains only the
+        # second one, and the first one is not used.
         logits = [branch(front)[:, 1:] for branch in self.semantic_branches]
         return self.resize_masks(torch.cat(logits, dim=1))
 
@@ -344,5 +362,8 @@ class LineHead(DetectionHead):
         return turn_raster(bev_feats, self.grid)
 
     def resize_masks(self, masks: Tensor) -> Tensor:
-        """Resize masks to the size of the targets. (B, n, h, w) -> (B, n, H, W)"""
+        """Resize n masks, of lines or classes, to the size of the targets.
+
+        (B, n, h, w) -> (B, n, H, W), where H and W are the rows and columns of ``mask_size``.
+        """
         return resize_map(masks.float(), self.mask_size)

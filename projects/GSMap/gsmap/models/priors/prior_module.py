@@ -1,6 +1,7 @@
 """Base class of the parts of a detector that read maps of earlier frames.
 
-A map prior, or prior, is a map of one place: the predictions of earlier frames in a town or scene.
+A map prior, or prior, is a map of one place, a town or a scene. It is made of the predictions of
+earlier frames there. The maps of several places are in an object of the class `PlaceMaps`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,10 +22,15 @@ from gsmap.utils.errors import InputError
 class PriorModule(BaseModule):
     """Part ``prior`` of a `MapDetector`, which reads maps of earlier frames.
 
-    For each batch the detector calls four methods in this order: `fuse` with the outputs of the
-    encoder, `hook` for an object that takes part in the steps of the head, `update_detections` with
-    the detections of a prediction, and `keep` with the hook, which has then received the
-    predictions of the head. In this base class, these methods have no effect.
+    For each batch, the detector calls methods in this order:
+
+    1. `fuse` with the outputs of the encoder, before the head.
+    2. `hook`, which returns an object that takes part in the steps of the head, or None.
+    3. `update_detections` with the detections of the head, only in a prediction, not in training.
+    4. `keep` with the object of `hook`, if there is one. It has received the predictions of the
+       head.
+
+    In this base class, these methods have no effect.
 
     Args:
         head: Head of the detector, a `MapHead`.
@@ -32,9 +38,9 @@ class PriorModule(BaseModule):
         init_cfg: Initialisation config of mmengine.
 
     Attributes:
-        reads_window: Whether `fuse` needs a window of a map, which is then an input of an exported
-            network.
-        window: Extent of a frame, divided into the cells at which maps are read.
+        reads_window: Whether `fuse` needs a window of a map, the part around the frame. It is then
+            an input of an exported network.
+        window: Extent of the part of a map around a frame, and the cells at which it is read.
         classes: Names of the classes.
 
     Raises:
@@ -49,7 +55,9 @@ class PriorModule(BaseModule):
             raise InputError(f"{type(head).__name__} can have no prior, which needs a MapHead.")
         self.window = head.grid.rasterized(cell_m)
         self.classes = head.classes
-        self._given: PlaceMaps | None = None  # maps of `use`; None for the maps of the model
+        # Maps that `use` has received. If None, a subclass reads and writes maps that it has
+        # created, the maps of the model.
+        self._given: PlaceMaps | None = None
 
     @property
     def calibration(self) -> tuple[str, ...]:
@@ -57,7 +65,11 @@ class PriorModule(BaseModule):
         return ()
 
     def new_maps(self) -> PlaceMaps:
-        """Create the empty maps of a training or a test, to which nothing is written."""
+        """Create the maps of a training or a test.
+
+        In this base class they are always empty, because nothing is written to them. A subclass
+        that writes maps creates other ones.
+        """
         return PlaceMaps(self.classes, self.window, memory="none")
 
     def new_prior(self, place: str) -> MapPrior:
@@ -90,20 +102,23 @@ class PriorModule(BaseModule):
         return GivenMaps(priors, self.classes, grid=self.window, update=update)
 
     def flush(self) -> None:
-        """Write the predictions that were passed to `keep` into the maps they were made with."""
+        """Write the predictions that were passed to `keep` into the maps.
+
+        These are the maps that were in use when the predictions were made.
+        """
 
     def use(self, maps: PlaceMaps | None) -> None:
         """Use these maps in tests from now on.
 
         Args:
-            maps: Maps of `maps_of` or `new_maps`; None for the maps of the model.
+            maps: Maps of `maps_of` or `new_maps`; None for the maps that the model has created.
         """
         self.flush()  # predictions so far belong to the maps before
         self._given = maps
 
     @contextmanager
     def using(self, maps: PlaceMaps) -> Iterator[None]:
-        """Use these maps in this context, and write all predictions at its end.
+        """Context manager that uses these maps, and writes all predictions at its end.
 
         Args:
             maps: Maps of `maps_of` or `new_maps`.
@@ -159,6 +174,7 @@ class PriorModule(BaseModule):
         """Store the predictions of a batch until `flush` writes them.
 
         Args:
-            hook: Result of `hook` for the batch, after the head has run; not called without a hook.
+            hook: Result of `hook` for the batch, after the head has run. If there is no hook, the
+                detector does not call this method.
             metas: Metainfo of each sample.
         """

@@ -1,4 +1,7 @@
-"""Memory of a detector: recall of the previous frames of a batch, and storage for the next ones."""
+"""Memory of a detector: values of previous frames are recalled, and new ones are stored.
+
+A batch has the current frame of each of B streams, sequences of frames of one drive.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -36,8 +39,9 @@ class BatchMemory:
 
     Args:
         outputs: Outputs of the encoder. Their ``bev_feats`` (B, C, H, W) are fused with the memory.
-        past: Memory of the previous frames and the ego motion since then, or None if nothing was
-            recalled.
+        past: Memory of the previous frames and the ego motion since then. None if no memory is
+            used: the model has none, or its only memory is of elements and it trains. A first frame
+            has a `Past`, too.
         propagation: Hook that adds the memory of queries to the head, or None.
         elements: Detections to store for the next frame, by name. (B, ...) each
         further_hooks: Hooks that are called before ``propagation``, such as the hook of a map
@@ -60,12 +64,13 @@ class BatchMemory:
 
 
 class StreamMemory(BaseModule):
-    """Memory of a `MapDetector`: one state per stream, a sequence of frames.
+    """Memory of a `MapDetector`, with one state for each stream, a sequence of frames.
 
-    The states are transformed to the current frame by the poses of the samples. In training, a
-    stream consists of the samples at one index of the batch (`Slots`). In testing, it is a scene
-    (`Scenes`), and every scene starts with an empty memory. The metainfo of a sample needs
-    ``scene``, ``timestamp_ns`` and ``lidar2global``.
+    A state has the latest frame of the stream and the values that were stored for it. States are
+    transformed to the current frame by the poses of the samples. In training, a stream consists of
+    the samples at one index of the batch (`Slots`). In testing, it is a scene (`Scenes`), and every
+    scene starts with an empty memory. The metainfo of a sample needs ``scene``, ``timestamp_ns``
+    and ``lidar2global``.
 
     Args:
         head: Head of the detector. It must be a `MapHead` if ``queries`` is given.
@@ -124,7 +129,8 @@ class StreamMemory(BaseModule):
         self.streams: Slots | Scenes = Slots(max_gap_s)
 
     def __str__(self) -> str:
-        # A copy of a stream, by pickle for example, recognises its model by this name.
+        # A stream is bound to its model (`Scenes.claim`). A copy of it, for example by pickle,
+        # contains this name instead of the model. A model of this name can continue the copy.
         return self.name
 
     def train(self, mode: bool = True) -> "StreamMemory":
@@ -144,7 +150,7 @@ class StreamMemory(BaseModule):
 
     @contextmanager
     def using(self, stream: Scenes) -> Iterator[None]:
-        """Use a memory of the caller instead of the model's memory in this context.
+        """Context manager that uses a memory of the caller instead of the model's memory.
 
         Args:
             stream: Memory that `new_stream` or `new_scenes` has created.
@@ -152,7 +158,8 @@ class StreamMemory(BaseModule):
         Raises:
             ValueError: If the stream belongs to another model.
         """
-        stream.claim(self)  # raises the error above
+        # Raises the error above. A stream that belongs to no model is bound to this one.
+        stream.claim(self)
         model_streams = self.streams
         self.streams = stream
         try:
@@ -164,7 +171,7 @@ class StreamMemory(BaseModule):
     def remember_batch(
         self, outputs: dict[str, Any], metas: Sequence[Mapping[str, Any]]
     ) -> Iterator[BatchMemory]:
-        """Recall the memory of a batch, and store its new memory at the end of the context.
+        """Context manager that recalls the memory of a batch, and stores its new memory at the end.
 
         Nothing is stored if the context ends with an error.
 
@@ -224,7 +231,7 @@ class StreamMemory(BaseModule):
 
         Returns:
             Updated detections of each sample; ``results`` without a memory of elements, or if
-            nothing was recalled.
+            ``batch.past`` is None.
         """
         if self.elements is None or batch.past is None:
             return results
@@ -233,7 +240,11 @@ class StreamMemory(BaseModule):
         return results
 
     def collect_memory(self, batch: BatchMemory) -> dict[str, Tensor]:
-        """Collect the memory to store for the next frame, by name, detached. (B, ...) each"""
+        """Collect the memory to store for the next frame, by name, without gradient. (B, ...) each
+
+        Args:
+            batch: Batch after the head has run.
+        """
         memory = dict(batch.elements)
         if self.bev is not None:
             memory["bev_feats"] = self.bev.remember(batch.outputs["bev_feats"])
@@ -250,7 +261,10 @@ class StreamMemory(BaseModule):
 def stack_past(
     frames: Sequence[Frame], states: Sequence[StreamState | None], device: torch.device
 ) -> Past:
-    """Stack the stream states of a batch. The memory of a stream that starts is zeros.
+    """Stack the stream states of a batch.
+
+    The memory of a stream that starts is zeros. If all streams start, the memory has no tensors,
+    because their names and shapes are not known.
 
     Args:
         frames: The frames of the batch.
@@ -258,7 +272,8 @@ def stack_past(
         device: Device of the result.
 
     Returns:
-        Memory, ego motion and elapsed time of each frame. A stream that starts has no motion.
+        Memory, ego motion and elapsed time of each frame. For a stream that starts, the motion is
+        the identity and the time is 0.
     """
     motions = []
     seconds = []
@@ -278,8 +293,8 @@ def stack_past(
         ],
         device,
     )
-    # All states have values of equal names and shapes, so any one serves as an example. If all
-    # streams start, the memory stays empty.
+    # All states have values of equal names and shapes, so any one serves as an example for the
+    # zeros. If all streams start, there is no example, and the memory stays empty.
     examples = next((state.values for state in states if state is not None), {})
     memory = {}
     for name, example in examples.items():

@@ -5,18 +5,21 @@
 In this file, p is the predicted mask and t is the ground-truth mask of one of n instances. A
 program computes ``BLOCK`` consecutive pixels of one instance. All kernels but `slope_rows_kernel`
 have the grid of programs (blocks, n). In the forward pass, the first kernel blurs p, t, p^2 + t^2
-and p t along rows. The second kernel blurs them along columns, computes SSIM, and writes the sums
-of its block to separate entries of a buffer (n, blocks, 7). There are no atomics, so repeated runs
-give bitwise equal results.
+and p t along rows. The second kernel blurs them along columns, computes SSIM, and writes the
+seven sums of `raster_loss_sums` over its block to separate entries of a buffer (n, blocks, 7).
+There are no atomics, so repeated runs give bitwise equal results.
 
-SSIM needs the variances of p and t only as their sum, so p^2 and t^2 are blurred together. With
-respect to p, the derivative of the blurred p^2 + t^2 is the derivative of the blurred p^2.
+SSIM needs the variances of p and t only as their sum, so one map of the blurred p^2 + t^2 replaces
+two maps. It is enough for the gradient as well: SSIM depends on p^2 only by this sum, so its
+derivative with respect to the blurred p^2 is its derivative with respect to the blurred sum.
 
 The backward pass computes the blurs again and, from them, the derivatives of SSIM with respect to
 the blurred p, p^2 and p t. The gradient with respect to a map before its blur is the transposed
 blur of the derivative. As the window is symmetric, the transposed blur equals the blur, so the
-derivatives are blurred once more. A kernel loads the neighbours of a pixel once for each tap
-(weight) of the window. Most of these loads are served by the cache.
+derivatives are blurred once more.
+
+For each pixel and each tap (weight of the window), a kernel loads one neighbour from memory. The
+windows of adjacent pixels overlap, so the cache serves most of these loads.
 """
 
 import torch
@@ -110,10 +113,10 @@ def _ssim_terms(maps, window, n, index, pixels, width, TAPS: tl.constexpr, BLOCK
     map_t = map_p + pixels
     map_squares = map_p + 2 * pixels
     map_product = map_p + 3 * pixels
-    p = _blur_columns(
+    mean_p = _blur_columns(
         map_p, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
-    t = _blur_columns(
+    mean_t = _blur_columns(
         map_t, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
     squares = _blur_columns(
@@ -122,11 +125,12 @@ def _ssim_terms(maps, window, n, index, pixels, width, TAPS: tl.constexpr, BLOCK
     product = _blur_columns(
         map_product, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
-    means = p * p + t * t
-    top_mean = 2 * p * t + C1
-    top_cov = 2 * (product - p * t) + C2
-    low_var = squares - means + C2  # the sum of both variances, plus C2
-    return p, t, top_mean, top_cov, means + C1, low_var
+    square_means = mean_p * mean_p + mean_t * mean_t
+    top_mean = 2 * mean_p * mean_t + C1
+    top_cov = 2 * (product - mean_p * mean_t) + C2
+    low_mean = square_means + C1
+    low_var = squares - square_means + C2  # the sum of both variances, plus C2
+    return mean_p, mean_t, top_mean, top_cov, low_mean, low_var
 
 
 @triton.jit
@@ -158,30 +162,31 @@ def sums_kernel(
         BLOCK: Number of pixels of a program.
     """
     n, pixels, index = _block(height, width, BLOCK=BLOCK)
-    ok = index < pixels  # pixels beyond the instance add nothing to the sums
+    inside = index < pixels  # pixels beyond the instance add nothing to the sums
     mean_p, mean_t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
         maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
     low = low_mean * low_var  # denominator of SSIM
     dissimilarity = (low - top_mean * top_cov) / low  # exactly 0 where both masks are empty
-    p = tl.load(preds + n * pixels + index, mask=ok, other=0.0)
-    t = tl.load(targets + n * pixels + index, mask=ok, other=0.0)
+    p = tl.load(preds + n * pixels + index, mask=inside, other=0.0)
+    t = tl.load(targets + n * pixels + index, mask=inside, other=0.0)
     excess = (weight - 1) * t
     # The weight of a pixel is w = 1 + excess. Beyond the instance, p and t are 0, so sums of them
-    # need no mask. There is one window around each pixel. The sums are in the order of the
-    # reference: w |p - t|, w p, 1 - SSIM, w t, w - 1, the number of windows with part of the
-    # target, and the number of windows with part of either mask.
+    # need no mask. The sums are in the order of the reference: w |p - t|, w p, 1 - SSIM, w t,
+    # w - 1, the number of windows with part of the target, and the number of windows with part of
+    # either mask. Each pixel has the window around it. A blurred mask is above 0 at a pixel if a
+    # part of the mask is in this window.
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * 7
     tl.store(out, tl.sum((1 + excess) * tl.abs(p - t)))
     tl.store(out + 1, tl.sum((1 + excess) * p))
-    tl.store(out + 2, tl.sum(tl.where(ok, dissimilarity, 0.0)))
+    tl.store(out + 2, tl.sum(tl.where(inside, dissimilarity, 0.0)))
     tl.store(out + 3, tl.sum((1 + excess) * t))
     tl.store(out + 4, tl.sum(excess))
     # As in the reference, the two numbers have different thresholds. For the first, any part of the
     # target counts. For the second, the coverage by either mask must exceed `MIN_COVERAGE`.
-    tl.store(out + 5, tl.sum((ok & (mean_t > 0)).to(tl.float32)))
+    tl.store(out + 5, tl.sum((inside & (mean_t > 0)).to(tl.float32)))
     either = (mean_p > COVERAGE) | (mean_t > COVERAGE)
-    tl.store(out + 6, tl.sum((ok & either).to(tl.float32)))
+    tl.store(out + 6, tl.sum((inside & either).to(tl.float32)))
 
 
 @triton.jit
@@ -199,16 +204,17 @@ def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK
         BLOCK: Number of pixels of a program.
     """
     n, pixels, index = _block(height, width, BLOCK=BLOCK)
-    p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
+    mean_p, mean_t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
         maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
-    # SSIM = A B / (C D), where A, B, C and D are the last four terms in this order. With respect to
-    # the blurred p, their derivatives are 2 t, -2 t, 2 p and -2 p. The blurred p^2 occurs only in
-    # D, with the derivative 1, and the blurred p t only in B, with the derivative 2. So the
-    # derivative of SSIM with respect to the blurred p is 2 (t (B - A) + p SSIM (C - D)) / (C D).
+    # SSIM = A B / (C D), where A, B, C and D are the last four terms in this order. Let P be the
+    # blurred p and T the blurred t (`mean_p` and `mean_t`). With respect to P, the derivatives of
+    # the four terms are 2 T, -2 T, 2 P and -2 P. So the derivative of SSIM with respect to P is
+    # 2 (T (B - A) + P SSIM (C - D)) / (C D). The blurred p^2 occurs only in D, with the derivative
+    # 1, and the blurred p t only in B, with the derivative 2.
     scale = 1 / (low_mean * low_var)
     ssim = top_mean * top_cov * scale
-    change = t * (top_cov - top_mean) + p * ssim * (low_mean - low_var)
+    change = mean_t * (top_cov - top_mean) + mean_p * ssim * (low_mean - low_var)
     out = slopes + n * 3 * pixels + index
     # Derivatives with respect to the blurred p, p^2 and p t.
     tl.store(out, 2 * change * scale, mask=index < pixels)
@@ -235,7 +241,7 @@ def slope_rows_kernel(
         BLOCK: Number of pixels of a program.
     """
     n, pixels, index = _block(height, width, BLOCK=BLOCK)
-    col = index % width
+    col = index % width  # a tap beyond the left or right edge would be in another row
     blur = tl.zeros((BLOCK,), dtype=tl.float32)
     for tap in tl.static_range(TAPS):
         shift = tap - TAPS // 2
@@ -387,8 +393,8 @@ def raster_loss_sums_backward(grads, preds, targets, window, weight):
     with torch.cuda.device_of(preds):
         maps = _blur_products(preds, targets, window=window)
         slopes_kernel[blocks, instances](window, maps, slopes=slopes, **sizes, **OPTIONS)
-        # The maps are not needed any more, so the next kernel writes its output to their memory. It
-        # takes three of the four maps per instance.
+        # The blurred products are not needed any more, so the next kernel writes its output to the
+        # beginning of their memory: they have four maps per instance, and the output has three.
         blurred = maps.view(-1)[: slopes.numel()]
         slope_rows_kernel[blocks, 3 * instances](
             window, slopes, blurred=blurred, **sizes, **OPTIONS
