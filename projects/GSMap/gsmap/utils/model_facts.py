@@ -5,7 +5,7 @@ metainfo of the training data set is stored in checkpoints.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from gsmap.utils.errors import InputError
 
@@ -41,7 +41,8 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
     sigmas = entries.get("sigmas")
     # In Python, True and False are integers.
     is_number = isinstance(sigmas, int | float) and not isinstance(sigmas, bool)
-    if law not in LAW_NAMES or not is_number or not 0 < sigmas <= 3:
+    is_in_range = is_number and 0 < cast(float, sigmas) <= 3
+    if law not in LAW_NAMES or not is_in_range:
         raise InputError(
             f"{CALIBRATION} must name a law of {LAW_NAMES} and sigmas in (0, 3], got "
             f"{calibration!r:.60}."
