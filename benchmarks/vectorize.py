@@ -1,4 +1,4 @@
-"""Time to trace lines in the maps that a trained HDMapNet predicts.
+"""Time to trace lines in the maps that a trained `HDMapNetHead` predicts.
 
 It is measured twice: at the size of the predicted maps, and at the size of the maps in the paper.
 """

@@ -64,7 +64,7 @@ class SplitList:
 
 def _families() -> list[str]:
     """Names of the files of published lists, in the order in which their splits are offered."""
-    # Backwards, so that the published lists of ``streammapnet`` come first.
+    # Backwards, so that the published lists of disjoint places come first.
     folder = files("mapdata").joinpath("split_lists")
     return sorted((Path(file.name).stem for file in folder.iterdir()), reverse=True)
 

@@ -176,7 +176,7 @@ class LineHead(DetectionHead):
     def coordinate_feature(self) -> Tensor:
         """Mean over the map of the features of its coordinates, cached in inference. (D,)
 
-        Differs from the papers of PivotNet and BeMapNet, as in their released code: the point
+        Differs from the papers of the subclasses, as in their released code: the point
         branches multiply their outputs by this mean instead of the features of single cells.
         """
         # In inference, the cached mean is valid while the versions of the weights do not change.

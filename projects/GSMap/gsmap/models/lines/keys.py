@@ -1,4 +1,4 @@
-"""Rules for the state keys that the released BeMapNet and PivotNet have in common.
+"""Rules for the state keys that the released heads of lines with masks have in common.
 
 The rules pair these keys with the keys of this project. `rules_of` takes a prefix of the released
 keys, a prefix of the keys here, and the remainders of the keys as one text: each is

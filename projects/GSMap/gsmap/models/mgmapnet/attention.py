@@ -185,8 +185,7 @@ class MultiPointAttention(PerPointSampling):
     """Attention that updates only the instance queries, from samples around all of their points.
 
     A linear layer computes the point queries from the instance query. This attention is the
-    baseline in the tables of MGMapNet. It corresponds to `LinePointAttention`, the attention of
-    StreamMapNet.
+    baseline in the tables of MGMapNet. It corresponds to `LinePointAttention`.
 
     Args:
         embed_dims: Channels C.

@@ -7,7 +7,7 @@ layers of a feed-forward network. `mlps` takes the prefixes of a multilayer perc
 release and here.
 
 ``BEV`` and ``LINE_DECODER`` are prefixes of released keys. ``LINE_DECODER_RULES`` and
-``HEAD_RULES`` are the rules that PivotNet and BeMapNet have in common.
+``HEAD_RULES`` are the rules that all heads of lines with masks have in common.
 """
 
 import torch

@@ -28,7 +28,7 @@ FAR = np.float32(np.inf)  # squared distance of a pixel without an edge within r
 # Farther pixels are 0 or 1.
 REACH = -math.log(1e-8)
 # Smallest x and y, and size of a pixel along x and y, of a raster in pixels. The centre of pixel
-# (row, col) is at (x, y) = (col, row), as in the rasterizer that Zhang et al. (MapVR) released.
+# (row, col) is at (x, y) = (col, row), as in the rasterizer of arXiv 2306.10502.
 INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)
 
 
