@@ -20,10 +20,7 @@ setup-dev:
 
 # Python and the kernels for the CPU leave compiled files behind for the next run. One thread per process: threads that
 # wait for each other cost more than they give.
-# Equal instructions on each x86 machine: with AVX-512, sums are rounded otherwise, which flips cells of the thresholded
-# attention masks of PivotNet and places of MapQR's samples, more than the golden quantities of tests/reference allow.
-ISA := $(if $(filter x86_64,$(shell uname -m)),ATEN_CPU_CAPABILITY=avx2 MKL_ENABLE_INSTRUCTIONS=AVX2)
-PYTEST = env -u PYTHONDONTWRITEBYTECODE $(ISA) OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest
+PYTEST = env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest
 
 # One process per core; one that is done takes tests from the end of another's list.
 test: setup-dev
