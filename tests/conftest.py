@@ -27,9 +27,11 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
 if platform.machine() == "x86_64":
     # Equal instructions on each machine: with AVX-512, sums are rounded otherwise. This flips cells
     # of PivotNet's thresholded attention masks and moves MapQR's samples, more than the golden
-    # quantities allow. torch and MKL read these when they first compute.
+    # quantities allow. torch, MKL and oneDNN read these when they first compute. If oneDNN used AMX
+    # and torch AVX2, torch's attention in bfloat16 would raise.
     os.environ["ATEN_CPU_CAPABILITY"] = "avx2"
     os.environ["MKL_ENABLE_INSTRUCTIONS"] = "AVX2"
+    os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE_BF16"
 
 # The same examples each time, however slow the machine is
 settings.register_profile(
