@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
-from tf2_ros import Buffer, TransformListener
+from tf2_ros import Buffer, TransformException, TransformListener
 from visualization_msgs.msg import Marker, MarkerArray
 
 from gsmap import MapElements, MapInferencer
@@ -56,10 +56,11 @@ class MapNode(Node):
     def cam_from_vehicle(self, info: Any) -> np.ndarray:
         """Transform from the vehicle to a camera, in metres. (4, 4)
 
-        tf raises an error if it has no such transform.
-
         Args:
             info: CameraInfo message, whose header names the frame of the camera.
+
+        Raises:
+            TransformException: If tf has no such transform (yet).
         """
         camera = info.header.frame_id
         # tf returns the transform from the second frame to the first one. `Time()` is the time 0,
@@ -81,7 +82,12 @@ class MapNode(Node):
                 # `p` belongs to the rectified image, and `k` to the image before rectification.
                 projection = np.reshape(info.p, (3, 4))
                 intrinsics[name] = projection[:, :3]
-                mounting[name] = self.cam_from_vehicle(info)
+                try:
+                    mounting[name] = self.cam_from_vehicle(info)
+                except TransformException as error:
+                    # tf sends the transforms after the start. The next step tries once more.
+                    self.get_logger().warning(f"no transform to camera {name} yet: {error}")
+                    return
             # The frame "vehicle" of the library has the axes and the origin of VEHICLE. CAMERAS may
             # have fewer cameras than the model was trained with.
             self.live = self.inferencer.live(

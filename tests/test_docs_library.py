@@ -76,10 +76,13 @@ class Message(SimpleNamespace):
 
 
 class Node:
-    """What the example uses of a node: topics, and what is published."""
+    """What the example uses of a node: topics, what is published, and warnings."""
 
     def __init__(self, name: str) -> None:
-        self.topics, self.published = {}, []
+        self.topics, self.published, self.warnings = {}, [], []
+
+    def get_logger(self):
+        return SimpleNamespace(warning=self.warnings.append)
 
     def create_subscription(self, kind, topic, callback, depth):
         self.topics[topic] = callback
@@ -91,11 +94,19 @@ class Node:
         assert period_s == 0.5
 
 
+class NoTransformError(Exception):
+    """tf has no such transform."""
+
+
 class Buffer:
     """Transforms of a front camera, 2 m ahead and 1.5 m up, and of its twin to the rear."""
 
+    filled = False
+
     def lookup_transform(self, target, source, time):
         assert source == "base_footprint"
+        if not self.filled:
+            raise NoTransformError("unknown frame")
         ahead = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
         turn = ahead if target == "front_optical" else np.array(ahead) @ np.diag([-1, -1, 1])
         x, y, z, w = Rotation.from_matrix(turn).as_quat()
@@ -113,7 +124,11 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
         "rclpy.time": {"Time": object},
         "geometry_msgs.msg": {"Point": Message},
         "sensor_msgs.msg": {"CameraInfo": Message, "Image": Message},
-        "tf2_ros": {"Buffer": Buffer, "TransformListener": lambda *_: None},
+        "tf2_ros": {
+            "Buffer": Buffer,
+            "TransformException": NoTransformError,
+            "TransformListener": lambda *_: None,
+        },
         "visualization_msgs.msg": {"Marker": Message, "MarkerArray": Message},
     }
     for name, content in names.items():
@@ -143,6 +158,10 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
         return lambda images: replace(found := run(images), scores=np.linspace(0, 1, len(found)))
 
     node.inferencer.live = scored
+    node.step()
+    assert node.published == rigs == []
+    assert node.warnings == ["no transform to camera CAM_FRONT yet: unknown frame"]
+    node.transforms.filled = True
     node.step()
     node.step()
     ((intrinsics, mounting, frame),) = rigs  # fitted once

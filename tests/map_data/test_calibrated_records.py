@@ -135,3 +135,25 @@ def test_a_missing_or_malformed_calibration_file_is_named(drive: Path) -> None:
     file = drive / "calibration.yaml"
     with pytest.raises(ValueError, match=r"camera 'front'.*unknown keys \['intrinsic'\]"):
         from_records(drive / "a", records_of(drive), META, drive, calibration=file)
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_name_of_images_of_different_times_is_refused_as_the_time_of_a_pose(
+    drive: Path, named: bool
+) -> None:
+    """Both cameras call their images 0 and 1, which the left one took 20 ms later."""
+    records = records_of(drive)
+    for number, record in enumerate(records):
+        for camera in record["cameras"]:
+            path = f"{camera['name']}/{number}.jpg"
+            (drive / camera["path"]).rename(drive / path)
+            camera["path"] = path
+    file = drive / "calibration.yaml"
+    if named:
+        poses = drive / "poses.csv"
+        poses.write_text(f"frame,x,y,z,qw,qx,qy,qz\n0,{EAST_M},{NORTH_M},30,1,0,0,0")
+        with pytest.raises(ValueError, match=r"line 2: frame '0' names images of different times"):
+            from_records(drive / "a.arrow", records, META, drive, calibration=file)
+    else:  # the names do not matter
+        from_records(drive / "a.arrow", records, META, drive, calibration=file)
+        assert len(AnnotationFile(drive / "a.arrow")) == 2

@@ -52,15 +52,18 @@ def calibrated_records(
     # Images of each camera. Their size is used if the calibration file has no ``size_px``.
     images: dict[str, list[Path]] = {}
     # Time of each image, by its file name without the suffix. A file of poses may refer to images
-    # by these names. If several images have one name, the time of the last image is used.
-    image_times: dict[str, int] = {}
+    # by these names. None: images of different times have this name.
+    image_times: dict[str, int | None] = {}
     for number, record in enumerate(records):
         # Errors in this context get the name of the record, and the advice.
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             for camera in record["cameras"]:
                 _require_keys(camera, file)
                 images.setdefault(str(camera["name"]), []).append(root / camera["path"])
-                image_times[Path(camera["path"]).stem] = _image_time_ns(camera, record)
+                stem = Path(camera["path"]).stem
+                time_ns = _image_time_ns(camera, record)
+                unique = image_times.setdefault(stem, time_ns) == time_ns
+                image_times[stem] = time_ns if unique else None
     # The cameras that have images, and the poses of the road below the vehicle. Without a file of
     # poses, `poses` is None.
     rig, poses = read_vehicle(file, images=images, time_of=image_times)

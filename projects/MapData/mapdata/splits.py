@@ -42,7 +42,7 @@ class SplitList:
 
         Args:
             missing: Names or tokens of the missing scenes.
-            total: Number of scenes of all parts.
+            total: Number of scenes that the data set should have, present and missing.
             where: Name of the data set, for the note.
             allowed: Whether scenes of a complete list may be missing.
 

@@ -67,14 +67,15 @@ def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]
 
 
 def read_vehicle(
-    file: Path, images: Mapping[str, Sequence[Path]], time_of: Mapping[str, int]
+    file: Path, images: Mapping[str, Sequence[Path]], time_of: Mapping[str, int | None]
 ) -> tuple[list[RigCamera], PoseTrack | None]:
     """Read the cameras and the poses of a calibration file for given images.
 
     Args:
         file: Calibration file. The path of its ``poses`` is relative to its folder.
         images: Images by the camera's name. Cameras of the file without images are left out.
-        time_of: Times of the images in nanoseconds, by their names without suffix.
+        time_of: Times of the images in nanoseconds, by their names without suffix. None if images
+            of different times have this name.
 
     Returns:
         The cameras, and the poses of the road below the vehicle, None if the file has no poses.
@@ -189,14 +190,15 @@ def ground_pose(content: Mapping[str, Any]) -> np.ndarray:
 
 
 def read_named_poses(
-    content: Mapping[str, Any], folder: Path, time_of: Mapping[str, int], ground: np.ndarray
+    content: Mapping[str, Any], folder: Path, time_of: Mapping[str, int | None], ground: np.ndarray
 ) -> PoseTrack | None:
     """Read the poses that a calibration file names.
 
     Args:
         content: Content of the calibration file.
         folder: Folder of the calibration file.
-        time_of: Times of the images in nanoseconds, by their names without suffix.
+        time_of: Times of the images in nanoseconds, by their names without suffix. None if images
+            of different times have this name.
         ground: Pose of the road in the vehicle's frame, in metres. (4, 4)
 
     Returns:

@@ -24,7 +24,7 @@ _LENGTH_TOLERANCE = 1e-2  # largest difference of a quaternion's length from 1
 _MOST_COLUMNS = 12  # largest number of columns that a message names
 
 
-def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> PoseTrack:
+def read_poses(path: Path, time_of: Mapping[str, int | None], ground: np.ndarray) -> PoseTrack:
     """Read poses from the columns x, y, z, qw, qx, qy, qz, and timestamp_ns or frame.
 
     The column ``frame`` has the names of images, whose times are the times of the poses. It has
@@ -34,7 +34,8 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
 
     Args:
         path: Text file, whose first line that is not blank names the columns.
-        time_of: Times of the images in nanoseconds, by their names without suffix.
+        time_of: Times of the images in nanoseconds, by their names without suffix. None if images
+            of different times have this name.
         ground: Transform from the road below the vehicle to the vehicle's frame, in metres. (4, 4)
 
     Returns:
@@ -117,12 +118,21 @@ def _require_columns(names: Collection[str]) -> None:
         )
 
 
-def _time_of(row: Mapping[str, str], time_of: Mapping[str, int]) -> int | None:
+def _time_of(row: Mapping[str, str], time_of: Mapping[str, int | None]) -> int | None:
     """Time of a row in nanoseconds; None if no image has the name in the row."""
     if _FRAME in row:
         # The name of an image, without or with its suffix.
         name = row[_FRAME]
-        return time_of.get(name, time_of.get(Path(name).stem))
+        if name not in time_of:
+            name = Path(name).stem
+        if name not in time_of:
+            return None
+        time_ns = time_of[name]
+        if time_ns is None:
+            raise InputError(
+                f"{_FRAME} {name!r:.60} names images of different times: give {_TIME} instead"
+            )
+        return time_ns
     text = row[_TIME]
     match = _NUMBER.fullmatch(text)
     if match:
