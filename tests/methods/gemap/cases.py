@@ -6,7 +6,12 @@ DEFORMABLE = {"type": "SpatialCrossAttention", "num_heads": 4, "num_points": 8, 
 EXPORTS = {
     "BEVFormer": (
         "configs/gemap/gemap_r18_minicity.py",
-        {"model.bev_encoder.cross_attn": {"_delete_": True, **DEFORMABLE}},
+        {
+            "model.bev_encoder.cross_attn": {"_delete_": True, **DEFORMABLE},
+            # a graph has the operators of each camera
+            "model.bev_encoder.num_cams": 2,
+            "test_dataloader.dataset.cameras": ["CAM_FRONT", "CAM_BACK"],
+        },
     )
 }
 

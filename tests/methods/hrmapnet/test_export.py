@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 from export_cases import POINTS_M, SCORES, shake
-from methods.hrmapnet.prior_cases import prior_model
-from model_cases import IMAGE_SHAPE, NUM_CAMS
+from methods.hrmapnet.prior_cases import PRIOR
+from model_cases import IMAGE_SHAPE, build_small, small_config
 from prior_cases import CLASSES, frames
 
 from gsmap.apis.export import export_onnx, largest_differences
@@ -19,6 +19,7 @@ for _package in ("onnx", "onnxscript", "onnxruntime"):
 
 
 HERE = ("town", "a", 0.0)
+NUM_CAMS = 2  # the graph has the operators of each camera
 IMAGES = np.random.default_rng(0).integers(0, 255, (NUM_CAMS, *IMAGE_SHAPE, 3), np.uint8)
 
 
@@ -29,7 +30,10 @@ def images_of(images, model):
 
 
 def test_a_file_reads_the_window_as_in_torch(tmp_path):
-    model = prior_model().eval()
+    encoder = {**small_config()["bev_encoder"], "num_cams": NUM_CAMS}
+    layer = {**PRIOR["bev"]["layer"], "num_cams": NUM_CAMS}
+    prior_cfg = {**PRIOR, "bev": {**PRIOR["bev"], "layer": layer}}
+    model = build_small(bev_encoder=encoder, prior=prior_cfg).eval()
     shake(model)
     model.map_head.coder.margin_m = None  # every query is found
     path = tmp_path / "model.onnx"
@@ -37,6 +41,7 @@ def test_a_file_reads_the_window_as_in_torch(tmp_path):
     exported = OnnxInferencer(path, num_threads=1)
     assert exported.prior_shape == (3, 48, 24)
     (sample,) = frames(HERE)
+    sample.set_metainfo({"lidar2img": sample.metainfo["lidar2img"][:NUM_CAMS]})
     meta = sample.metainfo
     prior = MapPrior(PriorSettings(CLASSES, "town", cell_m=1.25), KeepMaximum())
     maps = model.prior.maps_of([prior])
