@@ -2,6 +2,7 @@
 
 import pytest
 from method_cases import cases_of_methods
+from mmdet3d.registry import TRANSFORMS
 from mmengine.config import Config
 
 from gsmap.engine.launch import check_config, read_config
@@ -52,3 +53,19 @@ def test_wrapped_data_sets_and_steps_take_the_settings_too():
     cfg = read_config(cfg)
     (step,) = cfg.train_dataloader.dataset.dataset.pipeline[0].transforms
     assert step.num_points == cfg.model.map_head.num_points
+
+
+def test_the_direction_of_travel_of_the_grid_reaches_masks_and_maps():
+    """Masks of a square map would be turned by 90 degrees, in silence."""
+    checked = 0
+    for method in CASES:
+        cfg = read_config(f"configs/{method}/{method}_r18_minicity.py", {"model.grid.forward": "x"})
+        step = targets_of(cfg)
+        if not hasattr(TRANSFORMS.get(step.type), "forward"):
+            continue
+        assert step.forward == "x"
+        step.forward = "y"
+        with pytest.raises(ValueError, match=r"forward of .* is y.* require x"):
+            check_config(cfg)
+        checked += 1
+    assert checked >= 3

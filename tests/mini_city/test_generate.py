@@ -160,6 +160,21 @@ def test_no_link_is_followed_where_leftovers_are_removed(tmp_path: Path) -> None
     assert (elsewhere / "mine").read_text() == "mine"
 
 
+def test_a_link_to_an_empty_folder_is_filled_and_a_mount_point_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, link = tmp_path / "disk", tmp_path / "link"
+    disk.mkdir()
+    link.symlink_to(disk)
+    monkeypatch.setattr("minicity.generate._fill", lambda folder, *_, **__: None)
+    assert generate(link, 2, workers=0, **TINY)
+    assert [path.name for path in disk.iterdir()] == [MARKER]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "link"]
+    monkeypatch.setattr("os.path.ismount", lambda path: True)
+    with pytest.raises(ValueError, match="is a mount point: give a folder below it"):
+        generate(tmp_path / "mounted", 2, workers=0, **TINY)
+
+
 def test_a_failing_scene_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(self: SceneMaker) -> None:
         raise OSError("disk full")

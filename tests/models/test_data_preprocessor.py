@@ -9,6 +9,7 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
 import gsmap.registered  # noqa: F401
+from gsmap.datasets.transforms.image_steps import Resize
 
 SETTINGS = {
     "mean": [123.675, 116.28, 103.53],
@@ -65,3 +66,23 @@ def test_results_are_mmdet3ds(case):
 
 def test_it_has_no_state_of_its_own():
     assert not MODELS.build({"type": "MapDataPreprocessor", **SETTINGS}).state_dict()
+
+
+@pytest.mark.parametrize(
+    ("finished", "padded"), [([(16, 12), (16, 12)], (12, 16)), ([(16, 12), (8, 6)], (12, 16))]
+)
+def test_deferred_steps_run_on_images_of_different_sizes(finished, padded):
+    """Two rigs: their images are stacked, or padded, after the steps."""
+    images = [torch.full((2, 3, *size), 100, dtype=torch.uint8) for size in ((48, 64), (24, 32))]
+    samples = []
+    for number, size in enumerate(finished):
+        meta = {"token": f"token {number}", "image_steps": [Resize(size)]}
+        samples.append(Det3DDataSample(metainfo=meta))
+    preprocessor = MODELS.build(
+        {"type": "MapDataPreprocessor", "mean": [0.0] * 3, "std": [1.0] * 3}
+    )
+    imgs = preprocessor({"inputs": {"img": images}, "data_samples": samples})["inputs"]["imgs"]
+    assert imgs.shape == (2, 2, 3, *padded)
+    for sample, (width, height) in zip(imgs, finished, strict=True):
+        assert (sample[..., :height, :width] == 100).all()
+        assert sample.sum() == 100 * 2 * 3 * height * width

@@ -254,3 +254,13 @@ def test_the_published_model_has_the_published_parameters():
     model = MODELS.build(cfg.model)
     assert sum(p.numel() for p in model.parameters() if p.requires_grad) == 73_751_676
     assert sum(p.numel() for p in model.parameters()) == 73_977_020
+
+
+def test_mixed_precision_keeps_coordinates_in_float32():
+    """In bfloat16, points of an axis of 60 m would be multiples of 0.2 m."""
+    built = head().eval()
+    feats = torch.randn(1, 16, 8, 4, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        points = built({"bev_feats": feats})[-1].references[..., :2]
+    assert points.dtype == torch.float32
+    assert not torch.equal(points, points.bfloat16().float())

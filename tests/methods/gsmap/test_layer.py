@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from mmengine.registry import init_default_scope
 
 from gsmap.models.base.attention import place_samples
 from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
@@ -110,3 +111,14 @@ def test_a_decoder_takes_the_layer_that_is_guided():
     for decoder in ({}, {"type": MapDecoder}):
         layer = {"type": GaussianDecoderLayer, "ffn_dims": 4}
         assert add_guidance({**decoder, "layer": {"ffn_dims": 4}}) == {**decoder, "layer": layer}
+
+
+def test_the_guidance_of_a_layer_has_settings_or_is_switched_off():
+    plain = add_guidance({"num_layers": 1, "layer": {"guidance": None}})
+    plain["layer"].update(num_heads=2, ffn_dims=8)
+    init_default_scope("mmdet3d")
+    decoder = MapDecoder(**plain, embed_dims=8, num_points=3, space=SPACE)
+    assert decoder.layers[0].guidance is None
+    settings = {"guidance": {"sampling": False}}
+    guided = add_guidance({"num_layers": 1, "layer": settings})
+    assert guided["layer"]["guidance"] == {"type": GaussianGuidance, "sampling": False}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from methods.hrmapnet.prior_cases import PRIOR, prior_model
-from model_cases import build_small, make_images
+from model_cases import build_small, make_images, small_config
 from prior_cases import CLASSES, frames, pose_at
 
 from gsmap.models.hrmapnet import raster_prior
@@ -234,6 +234,13 @@ def test_a_model_without_its_parts_is_refused():
         RasterPrior(Pivot(), model.bev_encoder)
     with pytest.raises(ValueError, match="NoneType can have no prior, which needs a BEV encoder"):
         RasterPrior(model.map_head, None)
+
+
+def test_an_encoder_with_another_order_of_rows_can_have_a_prior():
+    encoder = {**small_config()["bev_encoder"], "type": "StreamMapNetEncoder", "num_levels": 1}
+    model = build_small(bev_encoder=encoder, prior=PRIOR).eval()
+    (found,) = predict(model, frames(("town", "a", 0.0)))
+    assert len(found.pred_instances_3d) > 0
 
 
 def test_a_pose_that_is_none_is_refused():

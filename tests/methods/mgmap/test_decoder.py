@@ -7,6 +7,7 @@ from mmengine.registry import init_default_scope
 
 from gsmap.models.mgmap.decoder import MaskedDecoded, MGMapDecoder, RefinedDecoded
 from gsmap.models.mgmap.refinement import crop_patches
+from gsmap.models.streams.query_memory import QueryMemory
 
 GROUPS = [{"num": N}, {"name": "one2many", "num": 2, "repeats": 2}]
 LOSSES = [*HEAD["losses"], {"type": "QueryMaskLoss"}, {"type": "ForegroundLoss"}]
@@ -118,3 +119,9 @@ def test_a_pipeline_without_masks_is_named():
     del gt.masks
     with pytest.raises(ValueError, match="add MakeInstanceMasks to the training pipeline"):
         losses_of(mgmap().train(), gt)
+
+
+def test_a_memory_of_queries_is_refused():
+    """The masks, which losses and the queries use, would belong to other queries."""
+    with pytest.raises(ValueError, match="MGMapDecoder has a mask for each of its own queries"):
+        QueryMemory(embed_dims=HEAD["embed_dims"], num=2).check(mgmap())

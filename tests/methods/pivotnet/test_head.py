@@ -1,5 +1,6 @@
 """PivotNet's head: decoding, bad settings, bad targets, any number of elements."""
 
+import numpy as np
 import pytest
 import torch
 from mmdet3d.registry import MODELS
@@ -9,9 +10,11 @@ from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
 
 import gsmap.registered  # noqa: F401
+from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.engine.launch import check_config, read_config
 from gsmap.models.pivotnet.head import PivotHead, PivotReference
+from gsmap.models.pivotnet.targets import FormatPivotTargets
 from gsmap.structures.grid import BEVGrid
 
 GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
@@ -160,3 +163,27 @@ def test_published_models_have_the_published_parameters():
         init_default_scope("mmdet3d")
         model = MODELS.build(cfg.model)
         assert sum(p.numel() for p in model.parameters() if p.requires_grad) == published
+
+
+def test_mixed_precision_keeps_coordinates_in_float32():
+    """In bfloat16, points of an axis of 60 m would be multiples of 0.2 m."""
+    built = head().eval()
+    feats = torch.randn(1, 16, 8, 4, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        points = built({"bev_feats": feats})[-1].references[..., :2]
+    assert points.dtype == torch.float32
+    assert not torch.equal(points, points.bfloat16().float())
+
+
+def test_masks_have_the_direction_of_travel_of_the_grid():
+    """A line along x, 10 m to the left of a vehicle that drives along x."""
+    grid = BEVGrid((-30.0, 30.0), (-30.0, 30.0), forward="x")
+    line = MapInstance(0, np.array([[-9.5, 10.5], [13.5, 10.5]]))
+    sizes = {"edge_classes": (), "pixel_m": 1.0, "thickness_px": 1}
+    targets = FormatPivotTargets(num_points=(4,), forward="x", **sizes)
+    results = {"map_instances": [line], "token": "a", "x_range": (-30, 30), "y_range": (-30, 30)}
+    (mask,) = targets.transform(results)["gt_instances_3d"].masks
+    rows, columns = mask.nonzero().T
+    front, left = (grid.front_from_metres(line.points) * 60).T
+    assert (rows.min(), rows.max()) == pytest.approx((front.min(), front.max()), abs=1)
+    assert set(columns.tolist()) == {int(left[0])}

@@ -69,3 +69,22 @@ def test_mixed_precision_keeps_depth_and_pooling_in_float32():
     assert outputs["depth"].dtype == torch.float32
     assert outputs["bev_feats"].isfinite().all()
     torch.testing.assert_close(outputs["depth"], exact["depth"], atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize(("depth_range", "bins"), [((1, 8.2, 0.5), 14), ((1, 5.3, 0.1), 43)])
+def test_a_part_of_a_bin_does_not_count_and_rounding_loses_none(depth_range, bins):
+    module = encoder(depth_range=depth_range)
+    outputs = module([feats()], [meta()])
+    assert outputs["depth"].shape[2] == bins
+    matrices = torch.eye(4).view(1, 1, 4, 4)
+    depths = module.points(matrices, (33, 65), feats())[0, 0, :, 0, 0, 2]
+    torch.testing.assert_close(depths, 1 + depth_range[2] * torch.arange(bins))
+
+
+def test_mixed_precision_keeps_points_in_float32():
+    """In bfloat16, points would move by up to 0.4 m."""
+    matrices = torch.as_tensor(calibration_arrays(meta(), ["frame_from_img"])["frame_from_img"])
+    module = encoder()
+    exact = module.points(matrices[None], (33, 65), feats())
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(module.points(matrices[None], (33, 65), feats()), exact)

@@ -20,7 +20,8 @@ from gsmap.utils.targets import NeedsTargets
 def share_settings(cfg: Config) -> None:
     """Copy settings of the head to the transforms that compute its targets, in place.
 
-    `NeedsTargets.target_settings` returns the settings to copy. A value that the config gives to a
+    `NeedsTargets.target_settings` returns the settings to copy. The axis ``forward`` of the model's
+    grid is copied, too. A value that the config gives to a
     transform explicitly is kept; `check_targets` compares it with the head.
 
     Args:
@@ -30,7 +31,7 @@ def share_settings(cfg: Config) -> None:
     # data set wrappers and variables.
     sections = [value for key, value in cfg.items() if key != "model"]
     for head in _heads(cfg):
-        head_settings = _target_settings(head)
+        head_settings = _target_settings(cfg, head=head)
         if not head_settings:
             continue
         transform_names = _class_with_targets(head.get("type")).transforms
@@ -45,7 +46,7 @@ def share_settings(cfg: Config) -> None:
 def _check_agreement(cfg: Config, steps: list[Any]) -> None:
     """Raise ValueError if a setting of a transform contradicts the settings of the head."""
     for head in _heads(cfg):
-        head_settings = _target_settings(head)
+        head_settings = _target_settings(cfg, head=head)
         transform_names = _class_with_targets(head.get("type")).transforms
         for step in _find_steps(steps, names=transform_names):
             for name in head_settings.keys() & step.keys():
@@ -57,15 +58,22 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
                     )
 
 
-def _target_settings(head: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of transforms that follow from the config of a head; empty for none."""
+def _target_settings(cfg: Config, head: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of transforms that follow from the model's grid and a head of a config.
+
+    Empty for none.
+    """
+    grid = cfg.model.get("grid")
+    forward = grid.get("forward") if isinstance(grid, dict) else None
+    grid_settings = {} if forward is None else {"forward": forward}
     # Typed as Any, because the cached function `_defaults` needs a hashable argument, and mypy does
     # not accept the class of a protocol as hashable.
     head_class: Any = _class_with_targets(head.get("type"))
     try:
-        return head_class.target_settings({**_defaults(head_class), **head})
+        head_settings = head_class.target_settings({**_defaults(head_class), **head})
     except (TypeError, ValueError):  # invalid settings, which the head reports when it is built
-        return {}
+        head_settings = {}
+    return {**grid_settings, **head_settings}
 
 
 def _heads(cfg: Config) -> list[dict[str, Any]]:

@@ -226,7 +226,8 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
         raise InputError(
             f"depth_range must be (low, high, step) with one bin or more, got {depth_range}."
         )
-    return int((high - low) / step)
+    # The small number makes up for rounding: 4.3 m have 43 bins of 0.1 m.
+    return int((high - low) / step + 1e-6)
 
 
 def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:

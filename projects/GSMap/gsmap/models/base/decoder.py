@@ -202,11 +202,14 @@ class MapDecoder(BaseModule):
         point_queries: True if the queries are of points (B, N * P, C), False if they are of
             instances (B, N, C).
         layer_class: Class of the layers if their config has no type.
+        has_query_masks: Whether outputs have a mask of each query of the first layer, so that
+            queries must not be replaced between layers.
         branches: For each output, the index of the prediction branches that are applied to it.
     """
 
     point_queries = True
     layer_class: ClassVar[type[MapDecoderLayer]] = MapDecoderLayer
+    has_query_masks: ClassVar[bool] = False
 
     def __init__(
         self,

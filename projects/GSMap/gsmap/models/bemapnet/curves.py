@@ -74,7 +74,8 @@ class Curve(nn.Module):
         Returns:
             Points along the curves. (..., 100, 2)
         """
-        return self.weights[pieces] @ controls
+        with torch.autocast(controls.device.type, enabled=False):  # half precision: up to 0.2 m off
+            return self.weights[pieces] @ controls
 
     def control_mask(self, pieces: Tensor) -> Tensor:
         """Return True for the control points that curves of ``pieces + 1`` pieces use.

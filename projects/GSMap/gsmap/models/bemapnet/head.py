@@ -188,14 +188,15 @@ class BezierHead(LineHead):
         degree = cast(Curve, self.curves[label]).degree
         point_shape = (2, self.point_dims)  # D channels for each of the two coordinates
         joint_feats = self.joint_branches[label](states).float()
-        joints = joint_feats.unflatten(-1, (-1, *point_shape)) @ mean
+        joints = self.coordinates_of(joint_feats.unflatten(-1, (-1, *point_shape)), mean)
         pieces = self.piece_branches[label](states).float()
         inner_shape = (pieces.shape[-1], degree - 1)  # (k, d - 1)
         if degree == 1:
             inner = joints.new_zeros((*pieces.shape[:2], *inner_shape, 2))  # an empty tensor
         else:
             inner_feats = self.inner_branches[label](states).float()
-            inner = inner_feats.unflatten(-1, (*inner_shape, *point_shape)) @ mean
+            inner_feats = inner_feats.unflatten(-1, (*inner_shape, *point_shape))
+            inner = self.coordinates_of(inner_feats, mean)
         return joints, inner, pieces
 
     def build_lines(

@@ -153,9 +153,11 @@ class LSSEncoder(CameraEncoder):
             Points in metres. (B, V, D, h, w, 3)
         """
         low, high, step = self.depth_range
+        # Rounding decides whether `high` itself is in `arange`, so one more depth is computed.
+        depths_m = torch.arange(low, high + step, step, device=feats.device)[: self.num_bins]
         return frustum_points(
             frame_from_img,
             image_size=img_shape,
             feature_size=(feats.shape[-2], feats.shape[-1]),
-            depths_m=torch.arange(low, high, step, device=feats.device),
+            depths_m=depths_m,
         )

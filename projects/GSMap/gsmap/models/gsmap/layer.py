@@ -62,7 +62,7 @@ def add_guidance(decoder: PartConfig) -> PartConfig:
         has_other_layers = decoder_class.layer_class is not MapDecoderLayer
     # By default the layers are of the guided class. If the decoder has a layer class other than
     # `MapDecoderLayer`, its layers keep this class and get the guidance as a part.
-    if not has_other_layers:
+    if not has_other_layers and "guidance" not in layer:
         return {**decoder, "layer": with_defaults(layer, type=GaussianDecoderLayer)}
     guidance = layer.get("guidance", {})
     if guidance is not None:  # None switches the guidance off

@@ -144,7 +144,8 @@ class ViewTransformEncoder(CameraEncoder):
             img_shape: Rows and columns of the padded images; unused.
 
         Returns:
-            ``bev_feats``, 0 where no camera map covers a cell. (B, C, H, W)
+            ``bev_feats``, 0 where no camera map covers a cell (B, C, H, W), and the input as
+            ``img_feats``.
         """
         camera_maps = self.transform_views(feats)  # (B, V, C, rows, columns)
         positions = self.cell_positions(calibration["cam_from_ground"])  # (B, V, H, W, 2)
@@ -152,7 +153,7 @@ class ViewTransformEncoder(CameraEncoder):
         samples = samples.unflatten(0, camera_maps.shape[:2])  # (B, V, C, H, W)
         # Camera maps are >= 0, because they come from a ReLU. So the 0 of a camera that does not
         # cover a cell never exceeds the value of another camera.
-        return {"bev_feats": samples.amax(dim=1)}
+        return {"bev_feats": samples.amax(dim=1), "img_feats": feats}
 
     def transform_views(self, feats: Tensor) -> Tensor:
         """Transform the features of each camera to its top-down camera map.

@@ -173,6 +173,22 @@ class LineHead(DetectionHead):
         """
         raise NotImplementedError
 
+    @staticmethod
+    def coordinates_of(feature: Tensor, mean: Tensor) -> Tensor:
+        """Logits of coordinates, in float32 even in mixed precision.
+
+        In half precision, coordinates on an axis of 60 m would be multiples of 0.2 m.
+
+        Args:
+            feature: Outputs of a branch for each coordinate. (..., D)
+            mean: Result of `coordinate_feature`. (D,)
+
+        Returns:
+            Scalar products. (...)
+        """
+        with torch.autocast(feature.device.type, enabled=False):
+            return feature.float() @ mean.float()
+
     def coordinate_feature(self) -> Tensor:
         """Mean over the map of the features of its coordinates, cached in inference. (D,)
 

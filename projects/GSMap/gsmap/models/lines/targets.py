@@ -106,6 +106,8 @@ class FormatLineTargets(BaseTransform):
             computed.
         sort_rings: Whether rings start at their rearmost vertex and run clockwise. Otherwise they
             keep the annotated order.
+        forward: Axis of the direction of travel, by default the longer side, as in `BEVGrid`.
+            Configs set ``model.grid.forward``, which is copied to this setting.
 
     Raises:
         ValueError: If a size is not positive, or ``edge_classes`` has an unknown class.
@@ -116,6 +118,7 @@ class FormatLineTargets(BaseTransform):
     thickness_px: int = 8
     step_m: float = 1.0
     sort_rings: bool = False
+    forward: str | None = None
 
     def __post_init__(self) -> None:
         check_positive(pixel_m=self.pixel_m, thickness_px=self.thickness_px, step_m=self.step_m)
@@ -203,7 +206,8 @@ class FormatLineTargets(BaseTransform):
         """
         # The transform is only passed to be named in the error of a sample without ground truth.
         elements = sorted(ground_truth_elements(results, self), key=lambda element: element.label)
-        grid = BEVGrid(results["x_range"], results["y_range"]).rasterized(self.pixel_m)
+        area = BEVGrid(results["x_range"], results["y_range"], forward=self.forward)
+        grid = area.rasterized(self.pixel_m)
         parts = []
         for element in elements:
             for line in self.lines(element, grid):

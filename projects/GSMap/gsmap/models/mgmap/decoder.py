@@ -87,6 +87,8 @@ class MGMapDecoder(MapDecoder):
         ValueError: If ``refinements`` is negative, or larger than the number of layers.
     """
 
+    has_query_masks = True
+
     def __init__(
         self,
         layer: dict[str, Any] | None = None,

@@ -246,7 +246,8 @@ class PivotBEVEncoder(CameraEncoder):
         # Each cell is a pillar of one point: uv in [0, 1] over each image, (B, V, Q, 1, 2), and
         # whether the point is inside the image, (B, V, Q).
         uv, visible = project_pillars(points[:, None], matrices, img_shape=img_shape)
-        score = torch.einsum("bvd,qd->bvq", matrices[:, :, 2], points)  # the depth
+        with torch.autocast(points.device.type, enabled=False):
+            score = torch.einsum("bvd,qd->bvq", matrices[:, :, 2], points)  # the depth
         if self.camera_by == "angle":  # depth / distance is the cosine of the angle
             camera_positions = torch.linalg.inv(matrices)[..., :3, 3]  # (B, V, 3)
             ground = points[None, :, :3].expand(len(camera_positions), -1, -1)

@@ -153,10 +153,10 @@ class PivotHead(LineHead):
         lines = []
         for label, class_lines in enumerate(layer):
             feature = self.point_branches[label](class_lines.states).float()  # (B, n, p, 2 D)
-            points = (feature.unflatten(-1, (2, -1)) @ mean).sigmoid()  # (B, n, p, 2)
+            points = self.coordinates_of(feature.unflatten(-1, (2, -1)), mean).sigmoid()
             predicted_lines = Lines(
                 logits=class_lines.logits.float(),
-                points=points,
+                points=points,  # (B, n, p, 2)
                 point_logits=self.kind_branches[label](feature).float(),
                 masks=class_lines.masks.float(),
             )

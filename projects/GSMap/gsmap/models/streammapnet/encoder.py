@@ -80,11 +80,11 @@ class StreamMapNetEncoder(BEVQueryEncoder):
             img_shape: Rows and columns of the padded images.
 
         Returns:
-            ``bev_feats`` (B, C, H, W), with row 0 at the smallest y. The image features, which the
-            base class also returns, are left out.
+            ``bev_feats`` (B, C, H, W), with row 0 at the smallest y, and the input as
+            ``img_feats``.
         """
-        bev_feats = super().encode(feats, calibration, img_shape=img_shape)["bev_feats"]
-        return {"bev_feats": bev_feats.flip(2)}
+        outputs = super().encode(feats, calibration, img_shape=img_shape)
+        return {**outputs, "bev_feats": outputs["bev_feats"].flip(2)}
 
     def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
         """Project the pillars of all cells into every camera. Row 0 of the cells has the largest y.

@@ -62,7 +62,12 @@ class QueryMemory(BaseModule, AddsWeights):
                 nn.init.zeros_(layer.weight)
 
     def check(self, head: FlowHead) -> None:
-        """Raise ValueError if the head has fewer than two layers or too few queries."""
+        """Raise ValueError if the head cannot have a memory of queries."""
+        if head.decoder.has_query_masks:
+            raise InputError(
+                f"{type(head.decoder).__name__} has a mask for each of its own queries, so it can "
+                "have no memory of queries: leave out temporal.queries."
+            )
         if len(head.decoder.layers) < 2:
             raise InputError(
                 "a memory of queries is inserted after the first decoder layer, but the head has "
