@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from report_case import vector, write_case
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSample
@@ -258,3 +259,35 @@ def test_rules_out_of_range_are_refused():
     for thresholds in ((0.0,), (0.5, math.nan, 1.0), (math.nan,), (math.inf,), ()):
         with pytest.raises(ValueError, match="thresholds must be > 0 m"):
             replace(CONFIG, thresholds=thresholds)
+
+
+def test_the_order_and_the_choice_of_classes_do_not_mix_them_up(tmp_path):
+    path, results = write_case(tmp_path)
+    file = AnnotationFile(path)
+    orders = [("divider", "ped_crossing", "boundary"), ("boundary", "divider", "ped_crossing")]
+    figures = []
+    for classes in orders:
+        config = replace(CONFIG, classes=classes, filled_classes=())
+        figures.append(evaluate_drives(results["good"], file, config)["consistency/C-mAP"])
+    assert figures[0] == figures[1] > 0
+    alone = evaluate_drives(
+        results["good"], file, replace(CONFIG, classes=("boundary",), filled_classes=())
+    )
+    assert alone["consistency/C-mAP"] == 1
+    unknown = replace(CONFIG, classes=("centerline",))
+    with pytest.raises(ValueError, match=r"has the classes .*, not \['centerline'\]"):
+        evaluate_drives(results["good"], file, unknown)
+
+
+def test_written_tracks_have_the_gaussians_and_no_element_of_another_class(tmp_path):
+    path, results = write_case(tmp_path)
+    content = json.loads(results["good"].read_text())
+    for sample in content["results"]:
+        sample["vectors"].append(vector("centerline", 0.95, [[0, 0], [0, 9]]))
+    results["good"].write_text(json.dumps(content))
+    evaluate_drives(results["good"], AnnotationFile(path), CONFIG, tmp_path / "tracks.json")
+    for sample in json.loads((tmp_path / "tracks.json").read_text())["results"]:
+        names = [found["cls_name"] for found in sample["vectors"]]
+        assert names == ["divider", "boundary", "divider"]
+        for found in sample["vectors"]:
+            assert len(found["gaussian_scales"]) == len(found["pts"])

@@ -25,14 +25,14 @@ def lane(x, scales, score=0.9, label=0):
     }
 
 
-def evaluate(predicted, xs=(0.0,)):
+def evaluate(predicted, xs=(0.0,), x_range=(-15, 15), y_range=(-30, 30)):
     metric = GaussianMetric()
     metric.dataset_meta = {"classes": CLASSES}
     lines = [np.array([[x, -20.0], [x, 20.0]]) for x in xs]
     sample = {
         "token": "a",
-        "x_range": (-15, 15),
-        "y_range": (-30, 30),
+        "x_range": x_range,
+        "y_range": y_range,
         "pred_instances_3d": predicted,
         "eval_ann_info": {"polylines": lines, "labels": np.zeros(len(lines), int)},
     }
@@ -76,3 +76,8 @@ def test_a_run_whose_gaussians_die_says_so(share, warnings, caplog):
     if warnings:
         assert "90 % of the Gaussians" in caplog.text
         assert "normalize='both'" in caplog.text
+
+
+def test_pixels_need_not_divide_the_map():
+    figures = evaluate(lane(0.0, (1.0, 0.3)), x_range=(-25, 25), y_range=(-50, 50))
+    assert figures["gaussians/soft_iou/divider"] > 0.6

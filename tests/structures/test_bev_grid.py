@@ -78,3 +78,11 @@ def test_impossible_grids_are_refused(arguments, message):
 def test_points_without_two_coordinates_are_refused():
     with pytest.raises(ValueError, match=r"end in \(x, y\)"):
         NUSCENES.norm_from_metres(torch.zeros(4, 1))
+
+
+def test_whole_numbers_have_results_with_decimals():
+    points = np.array([[3, 5], [14, 29]])
+    np.testing.assert_array_equal(
+        NUSCENES.norm_from_metres(points), NUSCENES.norm_from_metres(points.astype(float))
+    )
+    assert NUSCENES.norm_from_metres(points.astype(np.float32)).dtype == np.float32

@@ -42,3 +42,10 @@ def test_what_is_of_earlier_frames_is_zero():
     assert without_history(np.arange(1.0, 19.0)).tolist() == [0, 0, 0, *range(4, 18), 0]
     with pytest.raises(ValueError, match=r"18 values, got shape \(3,\)"):
         without_history(np.ones(3))
+
+
+def test_poses_may_be_rounded_as_annotation_files_allow():
+    exact, rounded = heading(33, 2, 4), heading(33, 2, 4).round(4)
+    turned = heading(40, 3, 4).round(4)
+    found = motion_signals((0.0, rounded), (-0.5, turned), None)
+    np.testing.assert_allclose(found[3:7], motion_signals((0.0, exact), None, None)[3:7], atol=1e-3)

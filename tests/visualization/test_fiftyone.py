@@ -1,6 +1,7 @@
 """JSON files of FiftyOne: cameras as slices of groups, map elements as polylines in the images."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,3 +63,22 @@ def test_results_of_other_samples_are_refused(annotations, tmp_path):
         write_fiftyone(tmp_path / "out.json", annotations, results=results)
     assert len(AnnotationFile(annotations)) == 1
     assert not (tmp_path / "out.json").exists()
+
+
+def test_the_ground_is_below_the_sensor_that_the_sample_has(tmp_path):
+    """A sensor at a height of 1.2 m: the ground lies at z = -1.2 in its frame."""
+    matrix = np.array(FRONT)
+    matrix[:3, 3] = matrix[:3, :3] @ [0, 0, -0.3]  # the camera is 0.3 m above the sensor
+    mounting = np.eye(4)
+    mounting[2, 3] = 1.2
+    camera = {"name": "front", "path": "a.jpg", "intrinsics": INTRINSICS, "width": 200}
+    cameras = [{**camera, "height": 100, "cam_from_frame": matrix}]
+    lines = [{"label": "divider", "points": [[5.0, 0], [20, 0]]}]
+    record = {"token": "a", "scene": "s", "cameras": cameras, "instances": lines}
+    meta = replace(META, frame="lidar", ground_z_m=None)
+    path = tmp_path / "val.arrow"
+    from_records(path, [{**record, "ego_from_frame": mounting}], meta, tmp_path)
+    write_fiftyone(tmp_path / "out.json", path)
+    (image,) = json.loads((tmp_path / "out.json").read_text())["samples"]
+    ((part,),) = [line["points"] for line in image["ground_truth"]["polylines"]]
+    assert part[0][1] == pytest.approx((50 + 150 / 5) / 100)

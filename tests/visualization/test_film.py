@@ -70,3 +70,42 @@ def test_a_scene_that_does_not_exist_is_named_with_one_that_does(tmp_path):
     with pytest.raises(ValueError, match="results must name at least one result file"):
         film.write_drive_film(tmp_path / "no.mp4", annotations, {})
     assert not (tmp_path / "no.mp4").exists()
+
+
+def test_pictures_of_other_sizes_are_shrunk_and_padded(tmp_path):
+    """A drive whose later samples have more cameras, which make the picture higher."""
+    pictures = [np.zeros((60, 80, 3), np.uint8), np.zeros((120, 80, 3), np.uint8)]
+    film.write_film(tmp_path / "film.mp4", pictures, [0, 10**9])
+    small, large = frames_of(tmp_path / "film.mp4")
+    assert small.shape == large.shape == (60, 80, 3)
+    assert large[:, :38].max() < 40
+    assert large[:, 42:].min() > 215
+
+
+def test_elements_of_other_classes_are_not_drawn_and_lines_may_be_empty(tmp_path):
+    annotations, results = write_case(tmp_path)
+    other = {"cls_name": "centerline", "pts": [[0, 0], [0, 9]]}
+    empty = {"cls_name": "boundary", "pts": []}
+    drawn = []
+    for more in ((), (other, empty)):
+        content = json.loads(results["good"].read_text())
+        for sample in content["results"]:
+            sample["vectors"] += [{**vector, "confidence_level": 0.9} for vector in more]
+        for sample in content["results"]:
+            for vector in sample["vectors"]:
+                vector.pop("gaussian_scales", None)
+                vector.pop("gaussian_rotations", None)
+        file = tmp_path / f"results{len(more)}.json"
+        file.write_text(json.dumps(content))
+        path = tmp_path / f"{len(more)}.mp4"
+        film.write_drive_film(path, annotations, {"a": file}, max_frames=1, width_px=480)
+        drawn.append(frames_of(path)[0])
+    np.testing.assert_array_equal(*drawn)
+
+
+@pytest.mark.parametrize("bad", [{"max_frames": 0}, {"score_thr": 1.5}])
+def test_numbers_out_of_range_are_refused(tmp_path, bad):
+    annotations, results = write_case(tmp_path)
+    (name,) = bad
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        film.write_drive_film(tmp_path / "drive.mp4", annotations, results, **bad)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from processes import run_tool
 from report_case import CLASSES, FRAMES, RING, STRANGE, write_case, write_changes_case
+from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.evaluation.analysis.distances import cut_by_distance, distance_groups
@@ -18,6 +19,7 @@ from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.file_evaluation import SamplePairs
 from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.frames import FRAME_VIEWS
+from gsmap.visualization.page.changes import ChangeLayer
 from gsmap.visualization.page.frames import cameras_of, choose_frames
 from gsmap.visualization.page.page import PageOptions, page_data, page_html
 
@@ -336,3 +338,20 @@ def test_wrong_figures_of_changes_are_named(case, tmp_path, name, value):
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=rf"feature 1: `{name}` must be a number of at least 0"):
         page_data(*case, replace(NO_IMAGES, changes=path))
+
+
+def test_a_change_far_from_the_origin_is_at_its_place_in_the_frame_of_a_tilted_vehicle(tmp_path):
+    """Changes are 2D: roll, pitch and height of the pose do not move them."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("ZYX", [0, 3, 1], degrees=True).as_matrix()
+    pose[:3, 3] = 4000, 2500, 60
+    annotations, _ = write_case(tmp_path)
+    sample = replace(AnnotationFile(annotations)[0], global_from_frame=pose)
+    content = json.loads(write_changes_case(tmp_path / "changes.geojson").read_text())
+    (feature, *_) = content["features"]
+    feature["geometry"]["coordinates"] = [[4000.0, 2505], [4000, 2510]]
+    content["features"] = [feature]
+    (tmp_path / "changes.geojson").write_text(json.dumps(content))
+    layer = ChangeLayer(tmp_path / "changes.geojson", AnnotationFile(annotations))
+    (entry,) = layer.entries(sample, FRAME_VIEWS["lidar"])
+    assert entry["p"] == [0, 500, 0, 1000]

@@ -66,7 +66,9 @@ class GaussianMetric(BaseMetric):
         predictions = sample["pred_instances_3d"]
         truth = sample["eval_ann_info"]
         extent = BEVGrid(x_range=sample["x_range"], y_range=sample["y_range"])
-        grid = extent.rasterized(PIXEL_M)
+        # Pixels of about PIXEL_M, which need not divide the map.
+        x_m, y_m = extent.extent_m
+        grid = extent.with_size(round(y_m / PIXEL_M), round(x_m / PIXEL_M))
         is_confident = predictions["scores_3d"] >= SCORE_THRESHOLD
         labels = predictions["labels_3d"][is_confident].cpu()
         means = predictions["pts"][is_confident].float().cpu()[..., :2]

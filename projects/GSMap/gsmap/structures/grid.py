@@ -201,7 +201,8 @@ def _affine(points: Array, scale: tuple[float, float], shift: tuple[float, float
         raise InputError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
     if isinstance(points, np.ndarray):
         xy = points[..., :2] * np.asarray(scale) + np.asarray(shift)
-        return np.concatenate([xy, points[..., 2:]], axis=-1).astype(points.dtype, copy=False)
+        dtype = points.dtype if points.dtype.kind == "f" else np.float64  # integers lack decimals
+        return np.concatenate([xy, points[..., 2:]], axis=-1).astype(dtype, copy=False)
     import torch
 
     # Numbers of Python need no copy to a GPU, as tensors would.

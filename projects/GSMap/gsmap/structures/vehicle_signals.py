@@ -10,6 +10,9 @@ from gsmap.structures.calibration import NUM_CAN_BUS
 
 Pose = tuple[float, NDArray[np.floating[Any]]]
 """Time in seconds, and transform from the vehicle to the world at that time in metres (4, 4)."""
+# Largest deviation of a rotation matrix from orthogonality. Poses of annotation files are checked
+# with 1e-3 for each entry.
+_ROTATION_TOLERANCE = 5e-3
 # Upward acceleration in m/s^2 that an accelerometer measures at rest, in the world.
 _GRAVITY = np.array([0.0, 0.0, 9.81])
 
@@ -28,12 +31,16 @@ def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float
     """
     values = np.zeros(NUM_CAN_BUS)
     values[:3] = global_from_ego[:3, 3]
-    # The tolerances are for the test of the matrix: it must be a rotation except for rounding.
-    values[3:7] = Quaternion(matrix=global_from_ego, atol=1e-6, rtol=1e-6).elements
+    values[3:7] = _rotation(global_from_ego[:3, :3]).elements
     yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
     values[16] = np.radians(yaw_deg)
     values[17] = yaw_deg
     return values
+
+
+def _rotation(matrix: NDArray[np.floating[Any]]) -> Quaternion:
+    """Rotation of a matrix (3, 3), which may be rounded."""
+    return Quaternion(matrix=matrix, atol=_ROTATION_TOLERANCE, rtol=_ROTATION_TOLERANCE)
 
 
 def pose_only_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -78,7 +85,7 @@ def motion_signals(
     acceleration = _GRAVITY
     if end > start:
         # Rotation of the vehicle from the start to the end, in its frame at the start.
-        rotation = Quaternion(matrix=first[:3, :3].T @ last[:3, :3], atol=1e-6, rtol=1e-6)
+        rotation = _rotation(first[:3, :3].T @ last[:3, :3])
         rotation_rate = rotation.axis * rotation.radians / (end - start)
         values[10:13] = rotation_rate
         velocity = ego_from_global @ (last - first)[:3, 3] / (end - start)

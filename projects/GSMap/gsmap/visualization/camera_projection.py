@@ -107,12 +107,14 @@ def subdivide(points: np.ndarray, step_m: float) -> np.ndarray:
     """Insert vertices into a polyline, so that no segment is longer than a step.
 
     Args:
-        points: Vertices in metres. (n >= 1, D)
+        points: Vertices in metres. (n, D)
         step_m: Largest length of a segment in metres.
 
     Returns:
         The given vertices and the inserted ones, in order. (m, D)
     """
+    if not len(points):
+        return points
     lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths_m / step_m).astype(int), 1)
     # The position i + s is at the share s of the segment from vertex i to vertex i + 1. A segment

@@ -73,7 +73,8 @@ def write_fiftyone(
         layers = {"ground_truth": elements_of_instances(sample.instances or [])}
         if predictions is not None and sample.token in places:
             layers["predictions"] = predictions.load(sample.token, places[sample.token])
-        samples += _images(sample, layers, view=view, classes=file.meta.classes, root=root)
+        sample_view = view.with_mounting(sample.ego_from_frame)
+        samples += _images(sample, layers, view=sample_view, classes=file.meta.classes, root=root)
     if not samples:
         raise InputError(f"{annotations} has no sample with a camera.")
     content = {**_schema(file, samples=samples), "samples": samples}

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -49,11 +50,28 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
                 height, width, _ = picture.shape
                 stream.height = height // 2 * 2
                 stream.width = width // 2 * 2
-            pixels = np.ascontiguousarray(picture[: stream.height, : stream.width])
+            pixels = _fit(picture, height=stream.height, width=stream.width)
             frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             film.mux(stream.encode(frame))
         if stream is not None:
             film.mux(stream.encode())  # without a frame, it returns the frames that were delayed
+
+
+def _fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Shrink a picture if it is larger than a film, and pad it in white. (H, W, 3) uint8
+
+    Pictures of one drive differ in size if its samples differ in their cameras. One odd row or
+    column is cut off.
+    """
+    rows, columns, _ = picture.shape
+    scale = min(1.0, height / (rows // 2 * 2), width / (columns // 2 * 2))
+    if scale < 1:
+        size = (int(columns * scale), int(rows * scale))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    canvas = np.full((height, width, 3), 255, np.uint8)
+    part = picture[:height, :width]
+    canvas[: part.shape[0], : part.shape[1]] = part
+    return canvas
 
 
 def write_drive_film(
@@ -96,6 +114,10 @@ def write_drive_film(
     """
     if not results:
         raise InputError("results must name at least one result file.")
+    if max_frames < 1:
+        raise InputError(f"max_frames must be >= 1, got {max_frames}.")
+    if not 0 <= score_thr <= 1:
+        raise InputError(f"score_thr must be in [0, 1], got {score_thr}.")
     file = AnnotationFile(annotations)
     scenes = list(dict.fromkeys(file.column("scene")))  # without repetition, in their order
     scene = scenes[0] if scene is None else scene
@@ -183,11 +205,14 @@ def _draw_frames(
 def _result_panel(name: str, frame: DriveFrame, score_thr: float) -> BEVPanel:
     """Panel of the predictions of a result, coloured by track if they have tracks.
 
-    Predictions with a score below ``score_thr`` are left out.
+    Predictions with a score below ``score_thr``, of other classes, or of fewer than two points are
+    left out.
     """
-    is_confident = frame.predictions.confidence >= score_thr
-    predictions = frame.predictions.select(is_confident)
+    is_drawn = frame.predictions.confidence >= score_thr
+    is_drawn &= frame.predictions.labels >= 0  # -1: a class that the annotation file lacks
+    is_drawn &= np.array([len(line) > 1 for line in frame.predictions.polylines], dtype=bool)
+    predictions = frame.predictions.select(is_drawn)
     if frame.track_ids is None:
         return BEVPanel(name, predictions)
-    colours = track_colours(frame.track_ids[is_confident])
+    colours = track_colours(frame.track_ids[is_drawn])
     return BEVPanel(f"{name}, tracks", predictions, colours=colours)

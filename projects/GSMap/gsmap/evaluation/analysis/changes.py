@@ -74,7 +74,7 @@ def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
     """
     poses: dict[str, list[FloatArray]] = {}
     for sample in annotations:
-        poses.setdefault(sample.map_name, []).append(_level(sample.global_from_frame))
+        poses.setdefault(sample.map_name, []).append(level_pose(sample.global_from_frame))
     meta = annotations.meta
     views = {}
     for name, global_from_frame in poses.items():
@@ -83,7 +83,7 @@ def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
     return views
 
 
-def _level(pose: FloatArray) -> FloatArray:
+def level_pose(pose: FloatArray) -> FloatArray:
     """Remove height, roll and pitch from a pose, since changes are 2D. (4, 4) -> (4, 4)"""
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
     level = np.eye(4)

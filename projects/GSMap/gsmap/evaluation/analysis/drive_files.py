@@ -5,6 +5,7 @@ consistency of predictions over the frames is evaluated with tracks.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from gsmap.evaluation.analysis.consistency import (
     group_by_scene,
     tracks_of,
 )
+from gsmap.evaluation.core.file_evaluation import file_labels
 from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
 from gsmap.structures.elements import IntArray, MapElements
 from gsmap.utils.errors import InputError
@@ -44,16 +46,20 @@ def drive_frames(
             track, or if two elements of a class in a sample have equal tracks. Also if the
             annotations have no poses, or a sample has no ground truth.
     """
-    return _read_frames(SampleFile(results, key=RESULTS_KEY, classes=classes), annotations)
+    samples = SampleFile(results, key=RESULTS_KEY, classes=classes)
+    return _read_frames(samples, annotations, classes=classes)
 
 
-def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFrame]:
+def _read_frames(
+    samples: SampleFile, annotations: AnnotationFile, classes: Sequence[str]
+) -> list[DriveFrame]:
     """Read the frames of all drives, as `drive_frames` does.
 
     Afterwards, ``samples.about`` (the metadata of the file) is set, because all samples are read.
     """
     if not annotations.meta.options.get("poses", True):
         raise InputError(f"{annotations.path} knows no poses, which consistency needs.")
+    labels = file_labels(annotations, classes)  # of the annotations, as indices of ``classes``
     results = samples.path
     predictions: dict[str, MapElements] = {}
     track_ids: dict[str, IntArray | None] = {}  # None for a sample without tracks
@@ -91,12 +97,15 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
         sample = annotations[row]
         if sample.instances is None:
             raise InputError(f"sample {sample.token!r} has no ground truth: it cannot be scored.")
+        truth = elements_of_instances(sample.instances)
+        truth = replace(truth, labels=labels[truth.labels])
+        truth = truth.select(truth.labels >= 0)
         frame = DriveFrame(
             token=sample.token,
             scene=sample.scene,
             pose=sample.global_from_frame,
             predictions=predictions[sample.token],
-            truth=elements_of_instances(sample.instances),
+            truth=truth,
             track_ids=track_ids[sample.token],
         )
         frames.append(frame)
@@ -149,8 +158,9 @@ def write_tracks(
     samples = []
     for scene in group_by_scene(frames):
         for frame, tracks in zip(scene, tracks_of(scene, config), strict=True):
-            vectors = vectors_of(frame.predictions, config.classes)
-            for vector, track in zip(vectors, tracks.tolist(), strict=True):
+            is_known = frame.predictions.labels >= 0  # -1: a class that is not evaluated
+            vectors = vectors_of(frame.predictions.select(is_known), config.classes)
+            for vector, track in zip(vectors, tracks[is_known].tolist(), strict=True):
                 vector[TRACK_KEY] = track
             samples.append((frame.token, vectors))
     meta = {**about, "classes": list(config.classes)}
@@ -180,8 +190,8 @@ def evaluate_drives(
         ValueError: If the file is malformed, lacks a sample or has invalid tracks
             (`drive_frames`), or if the annotations have no poses or no ground truth.
     """
-    samples = SampleFile(results, key=RESULTS_KEY, classes=config.classes)
-    frames = _read_frames(samples, annotations)
+    samples = SampleFile(results, key=RESULTS_KEY, classes=config.classes, gaussians=True)
+    frames = _read_frames(samples, annotations, classes=config.classes)
     figures = consistency(frames, config)
     if tracks_file is not None:
         write_tracks(tracks_file, frames=frames, config=config, about=samples.about)

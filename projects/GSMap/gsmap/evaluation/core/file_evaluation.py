@@ -16,7 +16,7 @@ from gsmap.evaluation.core.evaluator import MapEvaluator, SampleMatches
 from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
-from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import ordered_map
@@ -31,6 +31,31 @@ _CANVAS_TOLERANCE_M = 0.5  # ground truth that leaves a canvas by less than this
 CHUNK = 64
 Evaluation = tuple[list[MetricReport], list[str]]
 """Reports of all metrics, and notes on ignored elements, heights and samples."""
+
+
+def file_labels(file: AnnotationFile, classes: Sequence[str]) -> IntArray:
+    """Evaluated label of each class of an annotation file.
+
+    Args:
+        file: Annotation file.
+        classes: Names of the evaluated classes.
+
+    Returns:
+        Index into ``classes`` of each class of the file, -1 for other classes. (classes of the
+        file,)
+
+    Raises:
+        ValueError: If the file lacks one of the classes.
+    """
+    names = file.meta.classes
+    missing = [name for name in classes if name not in names]
+    if missing:
+        raise InputError(f"{file.path} has the classes {names}, not {missing}.")
+    labels = np.full(len(names), fill_value=-1)
+    for label, name in enumerate(names):
+        if name in classes:
+            labels[label] = classes.index(name)
+    return labels
 
 
 class AnnotatedTruth:
@@ -54,15 +79,8 @@ class AnnotatedTruth:
 
     def __init__(self, path: str | Path, classes: Sequence[str], shard: Shard = WHOLE) -> None:
         self._file = AnnotationFile(path)
-        names = self._file.meta.classes
-        missing = [name for name in classes if name not in names]
-        if missing:
-            raise InputError(f"{path} has the classes {names}, not {missing}.")
         # Index: label in the file. Entry: label in ``classes``, or -1 for other classes.
-        self._labels = np.full(len(names), fill_value=-1)
-        for label, name in enumerate(names):
-            if name in classes:
-                self._labels[label] = classes.index(name)
+        self._labels = file_labels(self._file, classes)
         self._rows = shard.part(range(len(self._file)))
         has_heights = self._file.meta.dim == 3
         # `SampleFile` counts its samples with heights under the key THREE_D. Here all samples of a

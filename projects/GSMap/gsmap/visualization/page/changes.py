@@ -14,7 +14,7 @@ import numpy as np
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.evaluation.analysis.change_files import KINDS, MapChange, read_changes
-from gsmap.evaluation.analysis.changes import with_map_names
+from gsmap.evaluation.analysis.changes import level_pose, with_map_names
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FrameView
 from gsmap.structures.polylines import clip_to_box, is_closed
@@ -56,7 +56,8 @@ class ChangeLayer:
             A dictionary for each piece of a change in the range: its kind (``kind``), a description
             (``text``) and its points (``p``), a flat list of (right, ahead) in whole centimetres.
         """
-        frame_from_global = invert_rigid(sample.global_from_frame)
+        # Changes have no height, so roll and pitch would shift points far from the origin.
+        frame_from_global = invert_rigid(level_pose(sample.global_from_frame))
         entries = []
         for index, change in enumerate(self._changes):
             if change.map_name != sample.map_name:
