@@ -157,3 +157,15 @@ def test_a_name_of_images_of_different_times_is_refused_as_the_time_of_a_pose(
     else:  # the names do not matter
         from_records(drive / "a.arrow", records, META, drive, calibration=file)
         assert len(AnnotationFile(drive / "a.arrow")) == 2
+
+
+def test_a_camera_twice_and_a_record_without_time_are_refused(drive: Path) -> None:
+    file = drive / "calibration.yaml"
+    records = records_of(drive)
+    records[1]["cameras"] *= 2
+    with pytest.raises(ValueError, match=r"record 't1'.*camera 'front' appears twice"):
+        from_records(drive / "a.arrow", records, META, drive, calibration=file)
+    records = records_of(drive)
+    del records[1]["timestamp_ns"]
+    with pytest.raises(ValueError, match=r"record 't1'.*names poses: give timestamp_ns"):
+        from_records(drive / "a.arrow", records, META, drive, calibration=file)

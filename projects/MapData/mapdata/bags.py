@@ -109,11 +109,14 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         # Without transforms, poses can only come from odometry, and the vehicle has no frame.
         has_frames = bool(content.tree.frames)
         vehicle = _choose_vehicle(content, wanted=options.vehicle_frame) if has_frames else ""
+        _require_own_topics(topics)
         rig = {}
         for camera, _ in calibrated_cameras:
             topic, _ = topics[camera.name]
             rig[topic] = camera
         content.digest.update(calibration.read_bytes())
+    # Images in the folder have the names of the cameras, and the calibration of the info topics.
+    content.digest.update(repr(sorted(topics.items())).encode())
     # If a model was trained on cameras of these names, distorted images are rectified to the
     # cameras of the model. The key describes these cameras.
     rectification_key = set_rectification_targets(list(rig.values()), options.trained)
@@ -274,6 +277,18 @@ def _require_messages(name: str, topics: tuple[str, str], content: BagContent) -
         )
 
 
+def _require_own_topics(topics: Mapping[str, tuple[str, str]]) -> None:
+    """Raise a ``ValueError`` if two cameras have one topic of images."""
+    camera_of: dict[str, str] = {}
+    for name, (topic, _) in topics.items():
+        if topic in camera_of:
+            raise InputError(
+                f"cameras {camera_of[topic]!r} and {name!r} have one topic of images, {topic}: "
+                "name another topic for one of them."
+            )
+        camera_of[topic] = name
+
+
 def _build_rig(
     topics: Mapping[str, tuple[str, str]],
     content: BagContent,
@@ -286,6 +301,7 @@ def _build_rig(
     Unusable cameras are left out with a note. If the user named the topics (``by_hand``), or if no
     camera is usable, the first error is raised instead.
     """
+    _require_own_topics(topics)
     rig = {}
     notes = []
     errors: dict[str, ValueError] = {}

@@ -77,6 +77,8 @@ def calibrated_records(
             rig_frame = _rig_frame(record, camera_of=camera_of, file=file)
             if pose_at is not None and record.get(_POSE) is not None:
                 raise InputError(f"{_POSE} is given, and {file} has poses, too: leave out one.")
+            if pose_at is not None and record.get("timestamp_ns") is None:
+                raise InputError(f"{file} names poses: give timestamp_ns.")
             scene = str(record.get("scene") or "")
             samples = rig_samples(scene, rig, frames=[rig_frame], pose_at=pose_at)
             if not samples:  # `rig_samples` leaves out a `RigFrame` without a pose
@@ -136,13 +138,15 @@ def _rig_frame(
         Token and time of the record, and the path and time in nanoseconds of each camera's image.
 
     Raises:
-        ValueError: If the calibration file lacks a camera.
+        ValueError: If the calibration file lacks a camera, or the record has a camera twice.
     """
     images: dict[str, tuple[str, int]] = {}
     for camera in record["cameras"]:
         name = str(camera["name"])
         if name not in camera_of:
             raise InputError(f"camera {name!r} is not in {file}, which has {sorted(camera_of)}.")
+        if name in images:
+            raise InputError(f"camera {name!r} appears twice.")
         images[name] = (str(camera["path"]), _image_time_ns(camera, record))
     time_ns = int(record.get("timestamp_ns") or 0)
     return RigFrame(str(record["token"]), time_ns=time_ns, images=images)

@@ -210,7 +210,8 @@ class RosBag:
         """
         begin_bag()  # starts to count the decompressed bytes, which `import_bounded` limits
         self._types = RosTypes()
-        self._is_ros1 = self.paths[0].suffix == ".bag"
+        # A folder is a bag of ROS 2, whatever its name.
+        self._is_ros1 = self.paths[0].suffix == ".bag" and not self.paths[0].is_dir()
         module = "rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2"
         reader_type = import_bounded(module).Reader
         for path in self.paths:

@@ -8,7 +8,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
-from bag_cases import Recorder, options, record, starting_at_0
+from bag_cases import Recorder, Straight, options, record, starting_at_0
 
 from gsmap.datasets.source import change_frame, ground_from_frame
 from gsmap.structures.elements import MapElements
@@ -48,6 +48,29 @@ def test_a_bag_gives_the_samples_that_were_recorded(drive, minicity_root, tmp_pa
     path = next(recorder.path.glob("*.mcap")) if kind == "mcap file" else recorder.path
     source = open_input(path, options(tmp_path))
     assert_recorded(source, drive, minicity_root)
+
+
+def test_other_topics_of_a_camera_give_its_own_images(tmp_path):
+    """A second try with corrected topics must not take the images of the first one."""
+    recorder = Recorder(tmp_path / "drive.bag", "mcap")  # a folder of ROS 2 with a name of ROS 1
+
+    def paint(camera, time_ns):
+        grey = 40 if camera.name == "cam0" else 220
+        picture = np.full((180, 320, 3), grey, np.uint8)
+        recorder.image(camera, time_ns, cv2.imencode(".jpg", picture)[1].tobytes())
+
+    path = Straight(recorder, names=("cam0", "cam1"), count=2).write(image=paint)
+    names = [(f"/{name}/image_raw/compressed", f"/{name}/camera_info") for name in ("cam0", "cam1")]
+    for topic, grey in zip(names, (40, 220), strict=True):
+        source = open_input(path, options(tmp_path, topics={"left": topic}))
+        (camera,) = source.samples[0].cameras
+        image = cv2.imread(str(source.data_root / camera.path))
+        np.testing.assert_allclose(image, grey, atol=2)
+    both = {"left": names[0], "right": (names[0][0], names[1][1])}
+    with pytest.raises(
+        ValueError, match="cameras 'left' and 'right' have one topic of images, /cam0"
+    ):
+        open_input(path, options(tmp_path, topics=both))
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgb8"])
