@@ -112,3 +112,12 @@ def assert_neighbours_stay_apart_in_bfloat16(reference: torch.nn.Module) -> None
         assert torch.equal(reference.start(states)[..., :2], start[..., :2])
         assert torch.equal(reference.refine(0, states, start)[..., :2], expected)
     assert len(expected.flatten(0, 1).unique(dim=0)) > 10
+
+
+def assert_float32_coordinates(head) -> None:
+    """Predict lines in bfloat16, in which points of a 60 m axis would be multiples of 0.2 m."""
+    feats = torch.randn(1, C, 8, 4, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        points = head.eval()({"bev_feats": feats})[-1].references[..., :2]
+    assert points.dtype == torch.float32
+    assert not torch.equal(points, points.bfloat16().float())

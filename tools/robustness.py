@@ -109,6 +109,7 @@ def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[s
     from mmdet3d.registry import DATASETS, METRICS
     from mmengine.dataset import pseudo_collate
 
+    model.eval()  # empties the memory and the maps of the previous case
     dataset = DATASETS.build(settings)
     metric = METRICS.build({"type": "MapMetric", "eval": ["chamfer"]})
     metric.dataset_meta = dataset.metainfo  # classes and range, which a runner would set

@@ -171,6 +171,7 @@ def test_a_link_to_an_empty_folder_is_filled_and_a_mount_point_is_refused(
     assert [path.name for path in disk.iterdir()] == [MARKER]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "link"]
     monkeypatch.setattr("os.path.ismount", lambda path: True)
+    assert not generate(link, 2, workers=0, **TINY)  # complete already
     with pytest.raises(ValueError, match="is a mount point: give a folder below it"):
         generate(tmp_path / "mounted", 2, workers=0, **TINY)
 

@@ -44,10 +44,17 @@ def test_every_kind_is_registered_and_in_the_table(tool):
     assert "| fog | 40.0 | 30.0 | 20.0 | 10.0 | 0.0 | 50 % |" in tool.table(found)
 
 
-def test_a_run_writes_table_figures_and_plot(tool, minicity_root, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("model", "samples"),
+    [("gsmap_r18_minicity", ["--samples", "1"]), ("gsmap_stream_finetune_r18_minicity", [])],
+    ids=["single frames", "a memory, empty at the start of each corruption"],
+)
+def test_a_run_writes_table_figures_and_plot(
+    tool, minicity_root, tmp_path, monkeypatch, model, samples
+):
     options = {"dataset": "minicity", "out_dir": tmp_path}
     convert_nuscenes(NuScenesOptions(minicity_root, "v1.0-trainval", **options))
-    words = ["gsmap_r18_minicity", "--data-root", str(minicity_root), "--samples", "1"]
+    words = [model, "--data-root", str(minicity_root), *samples]
     options = ["--kinds", "camera_lost", "camera_delayed", "camera_lost", "--out", str(tmp_path)]
     options += ["--cfg-options", f"test_dataloader.dataset.ann_file={tmp_path}/{FILE}"]
     monkeypatch.setattr("sys.argv", ["robustness.py", *words, *options])

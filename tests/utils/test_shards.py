@@ -55,6 +55,17 @@ def test_all_shards_are_found_in_their_order(tmp_path):
     assert not target.with_name("val.json.manifest").exists()
 
 
+def test_shards_of_a_file_with_a_longer_name_are_others(tmp_path):
+    target = write(tmp_path)
+    for path in list(tmp_path.iterdir()):
+        path.rename(path.with_name(path.name.replace("val.", "val.v2.")))
+    with pytest.raises(FileNotFoundError, match="no shards of"):
+        find_shards(target)
+    write(tmp_path)
+    names = [file.path.name for file in find_shards(target)]
+    assert names == [f"val.0000{index}-of-00003.json" for index in range(3)]
+
+
 def part(target: Path, index: int, suffix: str = "") -> Path:
     return Shard(index, 3).path_of(target).with_name(f"val.0000{index}-of-00003.json{suffix}")
 

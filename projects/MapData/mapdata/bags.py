@@ -109,12 +109,12 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         # Without transforms, poses can only come from odometry, and the vehicle has no frame.
         has_frames = bool(content.tree.frames)
         vehicle = _choose_vehicle(content, wanted=options.vehicle_frame) if has_frames else ""
-        _require_own_topics(topics)
         rig = {}
         for camera, _ in calibrated_cameras:
             topic, _ = topics[camera.name]
             rig[topic] = camera
         content.digest.update(calibration.read_bytes())
+    _require_own_topics(topics)
     # Images in the folder have the names of the cameras, and the calibration of the info topics.
     content.digest.update(repr(sorted(topics.items())).encode())
     # If a model was trained on cameras of these names, distorted images are rectified to the
@@ -301,7 +301,6 @@ def _build_rig(
     Unusable cameras are left out with a note. If the user named the topics (``by_hand``), or if no
     camera is usable, the first error is raised instead.
     """
-    _require_own_topics(topics)
     rig = {}
     notes = []
     errors: dict[str, ValueError] = {}

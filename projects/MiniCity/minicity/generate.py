@@ -141,11 +141,11 @@ def generate(
     if workers is not None and workers < 0:
         raise InputError(f"workers must be >= 0, got {workers}.")
     root = Path(os.path.realpath(root))  # a link could not be replaced by a folder at the end
-    if os.path.ismount(root):
-        raise InputError(f"{root} is a mount point: give a folder below it.")
     if is_complete(root, config):
         LOGGER.info("%s is complete already: nothing to do.", root)
         return False
+    if os.path.ismount(root):  # cannot be replaced either
+        raise InputError(f"{root} is a mount point: give a folder below it.")
     # The folder keeps another name until all files are written.
     with _partial_folder(root) as folder:
         _fill(folder, config, workers=workers, progress=progress)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from head_cases import assert_float32_coordinates
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.config import Config
@@ -166,13 +167,7 @@ def test_published_models_have_the_published_parameters():
 
 
 def test_mixed_precision_keeps_coordinates_in_float32():
-    """In bfloat16, points of an axis of 60 m would be multiples of 0.2 m."""
-    built = head().eval()
-    feats = torch.randn(1, 16, 8, 4, generator=torch.Generator().manual_seed(1))
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        points = built({"bev_feats": feats})[-1].references[..., :2]
-    assert points.dtype == torch.float32
-    assert not torch.equal(points, points.bfloat16().float())
+    assert_float32_coordinates(head())
 
 
 def test_masks_have_the_direction_of_travel_of_the_grid():

@@ -21,8 +21,8 @@ def share_settings(cfg: Config) -> None:
     """Copy settings of the head to the transforms that compute its targets, in place.
 
     `NeedsTargets.target_settings` returns the settings to copy. The axis ``forward`` of the model's
-    grid is copied, too. A value that the config gives to a
-    transform explicitly is kept; `check_targets` compares it with the head.
+    grid is copied, too. A value that the config gives to a transform explicitly is kept;
+    `check_targets` compares it with the head.
 
     Args:
         cfg: Config to change.
@@ -59,9 +59,10 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
 
 
 def _target_settings(cfg: Config, head: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of transforms that follow from the model's grid and a head of a config.
+    """Return the settings of transforms that follow from the grid and a head of a config.
 
-    Empty for none.
+    Returns:
+        Settings by name, with ``forward`` if the grid of the model names this axis.
     """
     grid = cfg.model.get("grid")
     forward = grid.get("forward") if isinstance(grid, dict) else None

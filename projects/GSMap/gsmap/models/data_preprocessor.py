@@ -40,23 +40,31 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
 
     def collate_data(self, data: dict[str, Any]) -> dict[str, Any]:
         """Copy a batch to the device and stack its images as ``imgs`` (B, V, 3, H, W)."""
+        samples = data.get("data_samples") or ()
         if _have_one_size(data["inputs"].get("img")):
             data = self.cast_data(data)
             imgs = torch.stack(data["inputs"]["img"])  # (B, V, 3, H, W)
-            imgs = self.run_deferred_steps(imgs, samples=data.get("data_samples") or ())
+            imgs = self.run_deferred_steps(imgs, samples=samples)
         else:
-            samples = data.get("data_samples") or ()
             if any(sample.metainfo.get("image_steps") for sample in samples):
-                data = self.cast_data(data)
-                images = []  # finished images of each sample (V, 3, H', W')
-                for sample_images, sample in zip(data["inputs"]["img"], samples, strict=True):
-                    images.append(self.run_deferred_steps(sample_images[None], [sample])[0])
-                data["inputs"]["img"] = images
+                data = self._finish_one_by_one(data)
             if not _have_one_size(data["inputs"].get("img")):
                 return super().collate_data(data)  # pads each image to the largest one
             imgs = torch.stack(data["inputs"]["img"])
         data["inputs"]["imgs"] = self.normalise(imgs)
         data.setdefault("data_samples", None)
+        return data
+
+    def _finish_one_by_one(self, data: dict[str, Any]) -> dict[str, Any]:
+        """Copy a batch to the device and run the deferred steps of each sample by itself.
+
+        Raw images of different sizes, as of two rigs, cannot be stacked before these steps.
+        """
+        data = self.cast_data(data)
+        images = []  # (V, 3, H', W') each
+        for raw_images, sample in zip(data["inputs"]["img"], data["data_samples"], strict=True):
+            images.append(self.run_deferred_steps(raw_images[None], samples=[sample])[0])
+        data["inputs"]["img"] = images
         return data
 
     @staticmethod

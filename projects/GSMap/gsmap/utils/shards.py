@@ -269,9 +269,12 @@ def find_shards(target: Path) -> list[ShardFile]:
         ValueError: If a shard is damaged, does not match its file name, or differs from the others
             in the number of shards, the options, the input or the version.
     """
+    # `a.v2.00000-of-00002.json` is a shard of `a.v2.json`, and none of `a.json`.
+    stem = re.escape(target.stem)
+    form = re.compile(rf"{stem}\.\d+-of-\d+{re.escape(target.suffix)}\.manifest", flags=re.ASCII)
     # Wildcards in the name of the file itself have no meaning.
-    pattern = f"{glob.escape(target.stem)}.*-of-*{glob.escape(target.suffix)}.manifest"
-    manifest_paths = sorted(target.parent.glob(pattern))
+    candidates = target.parent.glob(f"{glob.escape(target.stem)}.*.manifest")
+    manifest_paths = sorted(path for path in candidates if form.fullmatch(path.name))
     # `with_suffix` removes `.manifest`, and leaves the path of the shard.
     shards = [read_shard(path.with_suffix("")) for path in manifest_paths]
     if not shards:

@@ -104,7 +104,8 @@ def write_drive_film(
         width_px: Width of the film in pixels.
 
     Returns:
-        Text with the name of the drive, the number of frames and the path.
+        Text with the name of the drive, the number of frames and the path, and the number of
+        elements whose class the annotation file lacks.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -148,7 +149,14 @@ def write_drive_film(
         width_px=width_px,
     )
     write_film(path, pictures, times_ns)
-    return f"{scene}, {format_count(len(rows), 'frame')}: {path}"
+    text = f"{scene}, {format_count(len(rows), 'frame')}: {path}"
+    num_unknown = 0
+    for frames in frames_by_result.values():
+        for frame in frames[: len(rows)]:
+            num_unknown += int((frame.predictions.labels < 0).sum())
+    if num_unknown:
+        text += f"; {format_count(num_unknown, 'element')} of other classes left out"
+    return text
 
 
 def _draw_frames(
