@@ -118,6 +118,9 @@ def assert_float32_coordinates(head) -> None:
     """Predict lines in bfloat16, in which points of a 60 m axis would be multiples of 0.2 m."""
     feats = torch.randn(1, C, 8, 4, generator=torch.Generator().manual_seed(1))
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        points = head.eval()({"bev_feats": feats})[-1].references[..., :2]
+        mean = head.eval().coordinate_feature()  # kept for later batches, in float32 or not
+        points = head({"bev_feats": feats})[-1].references[..., :2]
+    head.train()
+    torch.testing.assert_close(mean, head.coordinate_feature().detach(), rtol=0, atol=0)
     assert points.dtype == torch.float32
     assert not torch.equal(points, points.bfloat16().float())

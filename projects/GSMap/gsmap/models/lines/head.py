@@ -207,15 +207,16 @@ class LineHead(DetectionHead):
         return self._cache[1]
 
     def _mean_feature(self) -> Tensor:
-        """Mean over the map of the features of its coordinates. (D,)"""
+        """Mean over the map of the features of its coordinates, always in float32. (D,)"""
         device = self.decoder.query.weight.device
         height, width = self.mask_size
         rows = torch.arange(height, device=device) / height
         cols = torch.arange(width, device=device) / width
         points = torch.stack(torch.meshgrid(cols, rows, indexing="xy"))  # (2, H, W), in [0, 1)
-        # The last convolution is linear, so it may follow the mean.
-        hidden = self.coordinates[:-1](points[None]).mean((2, 3), keepdim=True)
-        return self.coordinates[-1](hidden).flatten().float()
+        with torch.autocast(device.type, enabled=False):
+            # The last convolution is linear, so it may follow the mean.
+            hidden = self.coordinates[:-1](points[None]).mean((2, 3), keepdim=True)
+            return self.coordinates[-1](hidden).flatten().float()
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
         """Losses by name, summed over the layers.
