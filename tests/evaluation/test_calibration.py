@@ -98,6 +98,8 @@ def test_a_report_has_classes_lines_and_distances():
     assert sum(by_distance) == 400
     text = format_uncertainty(metrics)
     assert len(text.splitlines()) == 1 + 2 * 4 * 4
+    with pytest.raises(ValueError, match=r"^a class cannot be called 'line', since"):
+        uncertainty_report(joined, ("line", "divider", "boundary"), [])
     assert f"{metrics['uncertainty/line/across/nll']:.3f}" in text
 
 

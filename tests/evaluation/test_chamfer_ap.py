@@ -68,6 +68,16 @@ def test_hand_worked_ap():
     assert "without ground truth, left out of the means: boundary" in format_table(report)
 
 
+def test_classes_may_have_the_names_of_other_rows_of_the_table():
+    config = ChamferConfig(("class", "mean"))
+    truth = MapElements.from_polylines([upright(0.0)], [0])
+    found = MapElements.from_polylines([upright(0.0)], [0], [0.5])
+    report = chamfer_report(MatchTable([match_chamfer(found, truth, config, "a")]), config)
+    starts = [line.split()[0] for line in format_table(report).splitlines()]
+    assert starts[1::2] == ["class", "class", "mean", "mAP_chamfer"]
+    assert starts[4] == "mean"
+
+
 def test_precision_envelope_lifts_an_early_miss():
     """Miss (0.9), hit (0.8), hit (0.7) of two: precision 0, 1/2, 2/3, envelope 2/3 throughout.
 

@@ -204,6 +204,12 @@ def test_argoverse_range_turns_the_canvas():
     assert not mask[117].any()
 
 
+@pytest.mark.parametrize("name", ["line", "polygon"])
+def test_a_class_cannot_have_the_name_of_a_mean_over_classes(name):
+    with pytest.raises(ValueError, match=rf"^a class cannot be called '{name}', since"):
+        RasterConfig(("divider", name))
+
+
 def test_extended_classes_are_polygons():
     config = RasterConfig(("divider", "stop_line", "intersection", "carpark"))
     assert config.is_polygon == (False, True, True, True)

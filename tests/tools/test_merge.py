@@ -245,6 +245,28 @@ def test_figures_of_results_that_lie_in_shards(predictions, minicity_annotations
     assert target.read_bytes() == whole
 
 
+@pytest.mark.parametrize("annotated", [True, False], ids=["annotations", "json"])
+def test_elements_that_are_not_scored_are_added_up(
+    annotated, scored, predictions, minicity_annotations, tmp_path, capsys
+):
+    files = scored
+    if annotated:
+        files = (predictions, minicity_annotations["val"])
+    words = [*map(str, files), "--out", str(tmp_path / "m.json"), "--classes", "divider"]
+
+    def notes() -> set[str]:
+        return set(re.findall("^note: (.*)", capsys.readouterr().out, re.MULTILINE))
+
+    evaluate(words)
+    whole = notes()
+    for index in range(3):
+        evaluate([*words, "--shard", f"{index}/3"])
+    capsys.readouterr()
+    merge([str(tmp_path / "m.json")])
+    assert notes() == whole
+    assert any("ground truths of class" in note for note in whole)
+
+
 def test_what_a_shard_s_part_lacks_or_nobody_knows_is_an_error(scored, tmp_path):
     results, truth = scored
     words = [str(results), str(truth), "--out", str(tmp_path / "m.json"), "--shard", "1/2"]

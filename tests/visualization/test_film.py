@@ -3,6 +3,7 @@
 import json
 
 import av
+import cv2
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
@@ -80,6 +81,15 @@ def test_pictures_of_other_sizes_are_shrunk_and_padded(tmp_path):
     assert small.shape == large.shape == (60, 80, 3)
     assert large[:, :38].max() < 40
     assert large[:, 42:].min() > 215
+
+
+def test_an_image_of_another_size_than_its_calibration_is_refused(tmp_path):
+    annotations, results = write_case(tmp_path)
+    path = next(tmp_path.rglob("*.jpg"))
+    small = cv2.resize(cv2.imread(str(path)), dsize=None, fx=0.5, fy=0.5)
+    cv2.imwrite(str(path), small)
+    with pytest.raises(ValueError, match=r"sample 't0', camera .* pixels"):
+        film.write_drive_film(tmp_path / "no.mp4", annotations, results)
 
 
 def test_elements_of_other_classes_are_not_drawn_and_lines_may_be_empty(tmp_path):

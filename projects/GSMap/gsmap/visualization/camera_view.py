@@ -98,7 +98,8 @@ def camera_views(
     for camera in cameras:
         where = f"sample {token!r}, camera {camera.name}"
         try:
-            image = read_image(str(data_root / camera.path), where)[..., ::-1]  # BGR to RGB
+            size = (camera.width, camera.height)  # the intrinsics are for this size
+            image = read_image(str(data_root / camera.path), where, size)[..., ::-1]  # BGR to RGB
         except BrokenSampleError:
             if not grey:
                 raise

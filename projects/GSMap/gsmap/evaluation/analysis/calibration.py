@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
+from gsmap.evaluation.core.matches import check_group_names
 from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
@@ -254,7 +255,11 @@ def uncertainty_report(
         Report with keys such as ``uncertainty/divider/along/nll``, and with the distance
         ``uncertainty/divider/0-10m/along/nll``. The group ``line`` has all classes that are not
         areas. A group or a band without vertices has no figures.
+
+    Raises:
+        ValueError: If a class is called ``line``.
     """
+    check_group_names(classes, groups=["line"])
     groups: dict[str, list[int]] = {}
     line_labels = []
     for label, name in enumerate(classes):

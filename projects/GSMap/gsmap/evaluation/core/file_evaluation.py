@@ -31,6 +31,8 @@ _CANVAS_TOLERANCE_M = 0.5  # ground truth that leaves a canvas by less than this
 CHUNK = 64
 Evaluation = tuple[list[MetricReport], list[str]]
 """Reports of all metrics, and notes on ignored elements, heights and samples."""
+Note = tuple[int, str]
+"""Number of elements, and text that follows it; 0 for a text without a number in front."""
 
 
 def file_labels(file: AnnotationFile, classes: Sequence[str]) -> IntArray:
@@ -245,10 +247,11 @@ class SamplePairs:
         )
         self._truth = open_ground_truth(truth_path, classes=classes, shard=shard)
         self._allow_mismatch = allow_mismatch
-        self._other_shards: set[str] = set()  # tokens of samples that belong to other shards
         if shard.count:
             tokens = self._truth.tokens()
-            self._other_shards = set(tokens).difference(shard.part(tokens))
+            self._results.left_out = set(tokens).difference(shard.part(tokens))
+            if isinstance(self._truth, SampleFile):  # `AnnotatedTruth` has the part itself
+                self._truth.left_out = self._results.left_out
         self._mismatches: list[str] = []
         self._degenerate = 0  # number of ground truths of fewer than two points
         # Smallest and largest x and y of the ground truth in metres.
@@ -266,9 +269,7 @@ class SamplePairs:
         # them are stored with their elements, and further ones with their places in the file.
         pending_results: dict[str, Any] = {}
         pending_truth: dict[str, Any] = {}
-        results = self._items_of_shard(self._results)
-        truth = self._items_of_shard(self._truth)
-        for result_item, truth_item in zip_longest(results, truth):
+        for result_item, truth_item in zip_longest(self._results, self._truth):
             # An item is None after the end of its file. Otherwise, it has token, elements and
             # place.
             has_both = bool(result_item) and bool(truth_item)
@@ -305,15 +306,6 @@ class SamplePairs:
             elements = _load(self._truth, token, pending)
             yield self._pair(token, no_predictions, truth=elements)
 
-    def _items_of_shard(self, side: Iterable[Any]) -> Iterator[Any]:
-        """Yield token, elements and place of each sample that does not belong to other shards.
-
-        ``side`` is the file of results or of ground truth.
-        """
-        for item in side:
-            if item[0] not in self._other_shards:
-                yield item
-
     @property
     def about(self) -> dict[str, Any]:
         """Metadata of the result file; complete after iterating."""
@@ -328,32 +320,32 @@ class SamplePairs:
             self._high = np.maximum(self._high, points.max(axis=0))
         return Sample(token, predictions, truth)
 
-    def notes(self, counts_heights: bool, canvas: BEVGrid | None = None) -> list[str]:
+    def notes(self, counts_heights: bool, canvas: BEVGrid | None = None) -> list[Note]:
         """Return notes on ignored elements, heights, range and samples, after iterating.
 
         Args:
             counts_heights: Whether heights (z) count in a metric; if not, a note says so.
             canvas: Canvas of a metric that draws elements.
+
+        Returns:
+            Notes for `joined_notes`.
         """
-        notes = list(self._mismatches)
+        notes = [(0, note) for note in self._mismatches]
         ignored_predictions = Counter(self._results.ignored)
         ignored_truth = Counter(self._truth.ignored)
         num_with_heights = ignored_predictions.pop(THREE_D, 0) + ignored_truth.pop(THREE_D, 0)
         if num_with_heights and not counts_heights:
-            notes.append(
-                "some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)"
-            )
+            text = "some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)"
+            notes.append((0, text))
         if self._degenerate:
-            notes.append(
-                f"{self._degenerate} ground truths have fewer than two points: they count, but no "
-                "prediction can match them"
-            )
+            text = "ground truths have fewer than two points: they count, but no prediction can "
+            notes.append((self._degenerate, text + "match them"))
         if canvas is not None:
-            notes += self._canvas_notes(canvas)
+            notes += [(0, note) for note in self._canvas_notes(canvas)]
         for name, number in sorted(ignored_predictions.items()):
-            notes.append(f"{number} predictions of class {name!r} are not scored")
+            notes.append((number, f"predictions of class {name!r} are not scored"))
         for name, number in sorted(ignored_truth.items()):
-            notes.append(f"{number} ground truths of class {name!r} are not scored")
+            notes.append((number, f"ground truths of class {name!r} are not scored"))
         return notes
 
     def _canvas_notes(self, canvas: BEVGrid) -> list[str]:
@@ -369,6 +361,14 @@ class SamplePairs:
             f"ground truth reaches {truth_range}, and the canvas of raster metrics is "
             f"{_range_text(low, high)}: they do not count parts outside (--range)"
         ]
+
+
+def joined_notes(notes: Iterable[Note]) -> list[str]:
+    """Return notes as texts, with the sum of the numbers of equal texts, and without repeats."""
+    numbers: dict[str, int] = {}  # in the order of the first occurrence of a text
+    for number, text in notes:
+        numbers[text] = numbers.get(text, 0) + number
+    return [f"{number} {text}" if number else text for text, number in numbers.items()]
 
 
 def _range_text(low: FloatArray, high: FloatArray) -> str:
@@ -417,7 +417,7 @@ def evaluate_files(
     )
     matches = match_samples(pairs, evaluator, num_workers=num_workers)
     reports = evaluator.reports(matches)  # iterates over the pairs, which completes the notes
-    return reports, pairs.notes(evaluator.counts_heights, evaluator.canvas)
+    return reports, joined_notes(pairs.notes(evaluator.counts_heights, evaluator.canvas))
 
 
 def match_samples(

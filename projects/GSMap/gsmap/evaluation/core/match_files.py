@@ -1,9 +1,10 @@
 """Files with the matches of one shard (a part of the samples), and evaluation of all shards.
 
-A file is an npz archive with the array ``notes``, and for each metric the tokens of the samples as
-``<metric>/tokens``. The arrays of all samples are concatenated to ``<metric>/<name>``, and the
-length of each sample's part is in ``<metric>/<name>/lengths``. The manifest beside the file has the
-rules of the evaluation: names and settings of the metrics, and resampling of the ground truth.
+A file is an npz archive with the arrays ``notes`` and ``note_numbers``, and for each metric the
+tokens of the samples as ``<metric>/tokens``. The arrays of all samples are concatenated to
+``<metric>/<name>``, and the length of each sample's part is in ``<metric>/<name>/lengths``. The
+manifest beside the file has the rules of the evaluation: names and settings of the metrics, and
+resampling of the ground truth.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsmap.evaluation.core.evaluator import MapEvaluator, SampleMatches
+from gsmap.evaluation.core.file_evaluation import Note, joined_notes
 from gsmap.evaluation.core.metric import Matches, MetricSettings, arrays_of, matches_of
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.grid import BEVGrid
@@ -49,7 +51,7 @@ def write_matches(
     target: Path,
     shard: Shard,
     matches: Sequence[SampleMatches],
-    notes: Sequence[str],
+    notes: Sequence[Note],
     evaluator: MapEvaluator,
     settings: MetricSettings,
     source: str,
@@ -60,7 +62,7 @@ def write_matches(
         target: File for the figures of all shards; it determines the path of the shard.
         shard: Index of the shard, and number of shards.
         matches: For each sample of the shard, the record of each metric by the metric's name.
-        notes: Notes for the user.
+        notes: Notes for the user, as `SamplePairs.notes` returns them.
         evaluator: Evaluator, as `MapEvaluator.from_names` creates it from ``settings``.
         settings: Settings of the metrics.
         source: Digest of results and ground truth, by which the shards of one evaluation are
@@ -69,7 +71,10 @@ def write_matches(
     Returns:
         Path of the file of the shard.
     """
-    arrays = {"notes": np.array(notes, dtype=str)}
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "notes": np.array([text for _, text in notes], dtype=str),
+        "note_numbers": np.array([number for number, _ in notes], dtype=np.int64),
+    }
     for metric in evaluator.metrics:
         records = [sample[metric.name] for sample in matches]
         if records:  # a shard without samples has only the notes
@@ -112,7 +117,7 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
             rules, so the manifest of the first one is enough.
 
     Returns:
-        Reports of all metrics, and the notes of all shards without repeats.
+        Reports of all metrics, and the notes of all shards, with the sums of their numbers.
 
     Raises:
         ValueError: If a manifest contains no rules, or the matches of a shard do not fit the rules.
@@ -125,21 +130,21 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
             "create this shard again."
         ) from error
     matches: list[SampleMatches] = []
-    notes: list[str] = []
+    notes: list[Note] = []
     for shard in shards:
         try:
             with np.load(shard.path) as file:
-                notes += file["notes"].tolist()
                 arrays = dict(file)  # reads all arrays before the file is closed
-            if len(arrays) > 1:  # more than the notes: the shard has samples
+            texts = arrays.pop("notes").tolist()
+            notes += zip(arrays.pop("note_numbers").tolist(), texts, strict=True)
+            if arrays:  # the shard has samples
                 matches += _split_samples(arrays, evaluator)
         except (*_FAULTS, *DAMAGED_ZIP) as error:
             raise InputError(
                 f"the matches in {shard.path} do not fit the rules of its manifest ({error!r}): "
                 "make that shard again."
             ) from error
-    unique_notes = list(dict.fromkeys(notes))  # in the order of their first occurrence
-    return evaluator.reports(matches), unique_notes
+    return evaluator.reports(matches), joined_notes(notes)
 
 
 def _split_samples(arrays: Arrays, evaluator: MapEvaluator) -> list[SampleMatches]:

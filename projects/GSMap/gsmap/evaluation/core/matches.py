@@ -126,6 +126,20 @@ def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
     return names
 
 
+def check_group_names(classes: Sequence[str], groups: Sequence[str]) -> None:
+    """Require that no class has the name of a group of classes, whose figures have equal keys.
+
+    Raises:
+        ValueError: If a class has the name of a group.
+    """
+    for name in groups:
+        if name in classes:
+            raise InputError(
+                f"a class cannot be called {name!r}, since figures of this name are means over "
+                f"several classes: give it another name, or leave it out of the classes."
+            )
+
+
 def check_pair(
     predictions: MapElements, ground_truth: MapElements, classes: Sequence[str], token: str
 ) -> None:

@@ -22,6 +22,7 @@ from gsmap.evaluation.core.matches import (
     FrameMatches,
     MatchTable,
     assign,
+    check_group_names,
     check_pair,
     checked_classes,
     ranked_predictions,
@@ -73,6 +74,7 @@ class RasterConfig(Metric):
     def __post_init__(self) -> None:
         # The dataclass is frozen, which forbids a plain assignment.
         object.__setattr__(self, "classes", checked_classes(self.classes))
+        check_group_names(self.classes, groups=["line", "polygon"])
         if not 0 < self.px_per_m < math.inf or min(self.size_px) < 1:  # `not` is true for NaN, too
             raise InputError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
         # Integers could overflow in the product.

@@ -172,14 +172,14 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
     titles += ["recall", error_title, "calib. err.", "truths", "preds"]
     class_keys += [f"recall@{loosest}", error_key, f"calibration_error@{loosest}"]
     class_keys += ["num_gts", "num_preds"]
-    rows = {group: titles}
+    rows = [(group, titles)]
     for name in names:
-        rows[name] = [_cell(report, f"{name}/{key}") for key in class_keys]
-    rows["mean"] = [_cell(report, key) for key in mean_keys]
+        rows.append((name, [_cell(report, f"{name}/{key}") for key in class_keys]))
+    rows.append(("mean", [_cell(report, key) for key in mean_keys]))
 
-    name_width = max(len(name) for name in rows)
+    name_width = max(len(name) for name, _ in rows)
     lines = []
-    for name, cells in rows.items():
+    for name, cells in rows:
         line = name.ljust(name_width)
         # The row of means has cells for the AP columns only.
         for cell, title in zip(cells, titles, strict=False):

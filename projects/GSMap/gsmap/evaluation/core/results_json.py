@@ -9,7 +9,7 @@ their number, the name and the label of its class, and its score. A file of grou
 import heapq
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from itertools import pairwise
 from pathlib import Path
@@ -74,8 +74,9 @@ class SampleFile:
         gaussians: Whether to read the Gaussians of a sample if all of its elements have them.
 
     Attributes:
+        left_out: Tokens of samples that iterating leaves out, such as those of other shards.
         ignored: Number of elements of each other class, and number of samples with heights
-            (``THREE_D``), in the samples read so far.
+            (``THREE_D``), in the samples yielded so far.
         about: Metadata of the file. It is set after the last sample was read, and not validated.
     """
 
@@ -86,6 +87,7 @@ class SampleFile:
         self._key = key
         self._classes = classes
         self._gaussians = gaussians
+        self.left_out: Collection[str] = frozenset()
         self.ignored = Counter[str]()
         self.about: dict[str, Any] = {}
 
@@ -110,11 +112,13 @@ class SampleFile:
         # `items_of` sets the value of this key when it reaches the entry, which may come last.
         other_entries: dict[str, Any] = {"meta": None}
         for item, place in items_of(self.path, self._key, f"it must be {form}", other_entries):
-            token, elements = self._convert(item, self.ignored)
+            token = self._token_of(item)
             if token in tokens:
                 raise InputError(f"{self.path} holds sample {token!r} more than once.")
             tokens.add(token)
-            yield item, token, elements, place
+            if token not in self.left_out:
+                elements = self._elements_of(item, self.ignored)
+                yield item, token, elements, place
         meta = other_entries["meta"]
         self.about = meta if isinstance(meta, dict) else {}
 
@@ -141,31 +145,32 @@ class SampleFile:
         with self.path.open("rb") as file, suppress(ValueError):
             file.seek(start)
             item = json.loads(file.read(length))
-            token_in_file, elements = self._convert(item, ignored=Counter())
-            if token_in_file == token:
-                return elements
+            if self._token_of(item) == token:
+                return self._elements_of(item, ignored=Counter())
         raise InputError(
             f"{self.path} was changed while it was read: stop the program that writes to it, and "
             "start again."
         )
 
-    def _convert(self, item: Any, ignored: Counter[str]) -> tuple[str, MapElements]:
-        """Convert the JSON object of a sample to token and elements, and count ignored elements."""
+    def _token_of(self, item: Any) -> str:
+        """Return the token of the JSON object of a sample."""
         if not isinstance(item, dict) or not {"sample_token", "vectors"} <= item.keys():
             raise InputError(f"{self.path}: {item!r:.80} has no sample_token or no vectors.")
-        token = str(item["sample_token"])
+        return str(item["sample_token"])
+
+    def _elements_of(self, item: dict[str, Any], ignored: Counter[str]) -> MapElements:
+        """Convert the JSON object of a sample to elements, and count ignored elements."""
         try:
-            elements = read_vectors(
+            return read_vectors(
                 item["vectors"],
                 classes=self._classes,
                 ignored=ignored,
                 scored=self._key == RESULTS_KEY,
                 gaussians=self._gaussians,
             )
-            return token, elements
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InputError(
-                f"{self.path}, sample {token!r}: {error!r}; each vector needs pts, "
+                f"{self.path}, sample {self._token_of(item)!r}: {error!r}; each vector needs pts, "
                 "cls_name and, in results, confidence_level."
             ) from error
 
