@@ -222,10 +222,8 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
     for name, origin in sorted(origins.items()):
         if origin is None:
             maps_without_origin.append(name)
-    # Data without poses is marked by this option of the annotation file.
-    has_poses = ann.meta.options.get("poses", True)
     needs_poses = args.formats != ["mp4"] or args.prior or args.changes
-    if needs_poses and not has_poses:
+    if needs_poses and not ann.meta.has_poses:
         raise InputError(
             f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
             "mp4 shows the single frames."
@@ -646,7 +644,7 @@ def merge_drives(
         ValueError: If a map has the file name of the changes, an output would replace another
             program's file, or a drive has no results.
     """
-    has_poses = ann.meta.options.get("poses", True)
+    has_poses = ann.meta.has_poses
     # `file_names` gives each drive a safe file name. The names are chosen for all drives of the
     # annotation file, so that the name of a drive does not depend on the selected drives. They
     # stay different when "_lonlat" is appended to some of them.

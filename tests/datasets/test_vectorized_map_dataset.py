@@ -12,6 +12,7 @@ from height_cases import write_raised
 from mmengine.config import Config
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
+from gsmap.datasets.source import open_annotations
 from gsmap.structures.calibration import without_history
 
 CAMERAS = (
@@ -96,6 +97,35 @@ def test_a_speed_comes_from_the_pose_and_the_time_of_the_sample_beside(
     for row in range(2):
         velocity = dataset.get_data_info(row)["can_bus"][13:16]
         np.testing.assert_allclose(velocity, [6, 0, 0], atol=1e-6)
+    # Samples of another drive lie between these two.
+    others = [replace(sample, scene="other", token=f"{sample.token}-2") for sample in (here, later)]
+    write_annotations(path, source.meta, [here, others[1], later, others[0]])
+    dataset = build(**config, signals_from_poses=True)
+    for row in range(4):
+        velocity = dataset.get_data_info(row)["can_bus"][13:16]
+        np.testing.assert_allclose(velocity, [6, 0, 0], atol=1e-6)
+
+
+def test_an_image_size_needs_a_sample_with_one_of_the_cameras(
+    build, minicity_root, minicity_annotations, tmp_path
+):
+    source = AnnotationFile(minicity_annotations["train"])
+    without = replace(source[0], cameras=[], token="without")
+    path = tmp_path / "gsmap_minicity_train.arrow"
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root)
+    size = build(**config).scaled_image_size()
+    for samples, wanted in (([without, source[0]], size), ([without], None)):
+        write_annotations(path, source.meta, samples)
+        config = dataset_config(MINICITY, "train_dataloader", minicity_root, ann_file=str(path))
+        assert build(**config).scaled_image_size() == wanted
+
+
+def test_a_file_without_poses_has_none_as_a_source(minicity_annotations, tmp_path):
+    source = AnnotationFile(minicity_annotations["train"])
+    assert open_annotations(source.path).has_poses
+    options = {**source.meta.options, "poses": False}
+    write_annotations(tmp_path / "a.arrow", replace(source.meta, options=options), source)
+    assert not open_annotations(tmp_path / "a.arrow").has_poses
 
 
 def test_signals_of_the_pose_alone_are_those_of_maptr_on_argoverse_2(

@@ -60,7 +60,13 @@ def open_annotations(path: str | Path, data_root: Path | None = None) -> Source:
         if (folder / cameras[0].path).is_file():
             data_root = folder
     meta = annotations.meta
-    return Source(annotations, frame=meta.frame, data_root=data_root, ground_z_m=meta.ground_z_m)
+    return Source(
+        annotations,
+        frame=meta.frame,
+        data_root=data_root,
+        has_poses=meta.has_poses,
+        ground_z_m=meta.ground_z_m,
+    )
 
 
 _HEIGHT_TOLERANCE_M = 1e-3  # smaller differences of the height of the road are ignored

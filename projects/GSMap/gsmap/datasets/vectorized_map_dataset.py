@@ -30,6 +30,7 @@ _BROKEN_MODES = ("raise", "skip")
 _METAINFO_OF_FILE = (
     "classes", "x_range", "y_range", "dataset", "split", "frame", "ground_z_m", SPLIT_LIST,
 )  # fmt: skip
+_MAX_SAMPLES_WITHOUT_CAMERAS = 100  # before a data set counts as one without images
 _MAX_POSE_GAP_S = 5.0  # longest time between two poses for computing vehicle signals
 
 
@@ -307,14 +308,23 @@ class VectorizedMapDataset(BaseDataset):
             scenes.append([index for _, index in sorted(samples[name])])
         return scenes
 
-    def scaled_image_size(self) -> tuple[int, int]:
-        """Return the width and height of scaled images in pixels, from the first sample."""
-        widths = []
-        heights = []
-        for camera in self.sample(0).cameras:
-            if not self.cameras or camera.name in self.cameras:
-                widths.append(camera.width)
-                heights.append(camera.height)
+    def scaled_image_size(self) -> tuple[int, int] | None:
+        """Return the width and height of scaled images in pixels.
+
+        They are those of the first sample that has one of the cameras; None if there is none among
+        the first samples, as in a data set without images.
+        """
+        widths: list[int] = []
+        heights: list[int] = []
+        for index in range(min(len(self), _MAX_SAMPLES_WITHOUT_CAMERAS)):
+            for camera in self.sample(index).cameras:
+                if self.cameras is None or camera.name in self.cameras:
+                    widths.append(camera.width)
+                    heights.append(camera.height)
+            if widths:
+                break
+        else:
+            return None
         width = max(widths)
         height = max(heights)
         for step in self.pipeline.transforms:
@@ -372,7 +382,7 @@ class VectorizedMapDataset(BaseDataset):
             "dim": dim,
             "seconds": self.annotations.seconds_into_scene[entry["row"]],
             "timestamp": sample.timestamp_ns / 1e9,
-            "lidar2global": sample.global_from_frame if self._has_poses else None,
+            "lidar2global": sample.global_from_frame if self.annotations.meta.has_poses else None,
             "lidar2ego": sample.ego_from_frame,
             "can_bus": self._vehicle_signals(sample, entry["row"]),
             "images": images,
@@ -392,11 +402,6 @@ class VectorizedMapDataset(BaseDataset):
             info["lidar2global"] = frame.pose
         return info
 
-    @property
-    def _has_poses(self) -> bool:
-        """Whether the poses of the vehicle are known, which is the default of a file."""
-        return bool(self.annotations.meta.options.get("poses", True))
-
     def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
         """Return the vehicle signals of a sample, zero if unknown. (18,)
 
@@ -414,7 +419,7 @@ class VectorizedMapDataset(BaseDataset):
             return without_history(pose_only_signals(global_from_ego))
         if sample.can_bus is not None:
             return without_history(sample.can_bus)
-        if not self._signals_from_poses or not self._has_poses:
+        if not self._signals_from_poses or not self.annotations.meta.has_poses:
             return np.zeros(NUM_CAN_BUS)
         return without_history(self._signals_of_motion(sample, row))
 
@@ -424,13 +429,10 @@ class VectorizedMapDataset(BaseDataset):
 
         before = None
         after = None
-        # Rows need not be in the order of time, so the signs of the differences decide.
-        for neighbour_row in (row - 1, row + 1):
-            if not 0 <= neighbour_row < len(self.annotations):
-                continue
+        for neighbour_row in self.annotations.neighbours_in_scene(row):
             neighbour = self.annotations[neighbour_row]
             seconds = (neighbour.timestamp_ns - sample.timestamp_ns) / 1e9
-            if neighbour.scene != sample.scene or abs(seconds) > _MAX_POSE_GAP_S:
+            if abs(seconds) > _MAX_POSE_GAP_S:
                 continue
             pose = (seconds, self._global_from_ground(neighbour))
             if seconds < 0 and before is None:

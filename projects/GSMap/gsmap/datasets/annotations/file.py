@@ -443,6 +443,32 @@ class AnnotationFile(Sequence[MapSample]):
             seconds.append((time_ns - starts_ns[scene]) / 1e9)
         return seconds
 
+    @cached_property
+    def _time_order(self) -> tuple[np.ndarray, np.ndarray]:
+        """Scene of each row as a number, and the rows in the order of their scenes and times."""
+        numbers: dict[str, int] = {}
+        scenes = np.array([numbers.setdefault(s, len(numbers)) for s in self.column("scene")])
+        return scenes, np.lexsort((self.column("timestamp_ns"), scenes))
+
+    @cached_property
+    def _time_places(self) -> np.ndarray:
+        """Place of each row in the order of scenes and times."""
+        _, order = self._time_order
+        return np.argsort(order)
+
+    def neighbours_in_scene(self, row: int) -> list[int]:
+        """Return the rows of the samples before and after a sample of the same scene.
+
+        The first and the last sample of a scene have one neighbour, a single sample has none.
+        """
+        scenes, order = self._time_order
+        place = int(self._time_places[row])
+        rows = []
+        for other_place in (place - 1, place + 1):
+            if 0 <= other_place < len(order) and scenes[order[other_place]] == scenes[row]:
+                rows.append(int(order[other_place]))
+        return rows
+
     def instance_counts(self) -> np.ndarray:
         """Return the number of map elements of each sample, -1 without ground truth. (samples,)"""
         counts = [np.empty(0, dtype=np.int64)]  # the result for a file without batches

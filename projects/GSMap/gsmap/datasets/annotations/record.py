@@ -218,6 +218,11 @@ class AnnotationMeta:
         return self.options.get(SPLIT_LIST, "")
 
     @property
+    def has_poses(self) -> bool:
+        """Whether the poses of the vehicle are known."""
+        return bool(self.options.get("poses", True))
+
+    @property
     def crossings(self) -> str:
         """Rule by which pedestrian crossings become elements, by default ``united``.
 

@@ -57,7 +57,7 @@ def _read_frames(
 
     Afterwards, ``samples.about`` (the metadata of the file) is set, because all samples are read.
     """
-    if not annotations.meta.options.get("poses", True):
+    if not annotations.meta.has_poses:
         raise InputError(f"{annotations.path} knows no poses, which consistency needs.")
     labels = file_labels(annotations, classes)  # of the annotations, as indices of ``classes``
     results = samples.path
