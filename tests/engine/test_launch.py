@@ -174,6 +174,22 @@ def test_loaders_that_tear_streams_apart_are_refused(changes, reason):
     check_config(read_config(Config({**WITH_MEMORY, **changes, "model": {"temporal": None}})))
 
 
+@pytest.mark.parametrize(
+    "loop", [{"type": "IterBasedTrainLoop", "max_iters": 10}, {"by_epoch": False, "max_iters": 10}]
+)
+@pytest.mark.parametrize("name", ["streammapnet_r18_minicity", "hrmapnet_r18_minicity"])
+def test_a_loop_that_would_empty_the_memory_in_each_iteration_is_refused(name, loop):
+    cfg = read_config(name)
+    cfg.param_scheduler = []
+    check_config(cfg)
+    cfg.train_cfg = loop
+    with pytest.raises(ValueError, match=r"train_cfg counts iterations, .*'EpochBasedTrainLoop'"):
+        check_config(cfg)
+    cfg.model.temporal = None
+    cfg.model.prior = None
+    check_config(cfg)
+
+
 def test_a_memory_of_elements_alone_is_not_trained_and_needs_order_in_tests_only():
     train = {"train_dataloader": {"batch_size": 2, "sampler": {"type": "DefaultSampler"}}}
     elements = {**WITH_MEMORY, **train, "model": {"temporal": {"elements": {}}}}

@@ -80,6 +80,9 @@ def test_models_whose_steps_cannot_be_recorded_are_named():
         build(cuda_graphs=True, compiled=True)
     with pytest.raises(ValueError, match=r"cuda_graphs=True .* remembers earlier frames"):
         build(cuda_graphs=True, temporal={"bev": {}})
+    model = torch.nn.SyncBatchNorm.convert_sync_batchnorm(build(cuda_graphs=True))
+    with pytest.raises(ValueError, match=r"cuda_graphs=True .* wait for other processes \(SyncBN"):
+        model.loss(make_images(1), make_samples(TWO))
 
 
 def test_autocast_around_the_model_is_refused():

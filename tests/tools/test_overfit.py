@@ -6,6 +6,7 @@ import pytest
 from mmengine.config import Config
 from processes import run_tool
 
+from gsmap.engine.launch import read_config
 from gsmap.engine.overfitting import LOG_LINES, overfit
 
 ITERATIONS = 150
@@ -68,3 +69,8 @@ def test_the_option_refuses_bad_numbers_and_wrapped_data(samples, iterations, ch
     cfg = Config({"train_dataloader": {**loader, **changes}})
     with pytest.raises(ValueError, match=message):
         overfit(cfg, samples, iterations)
+
+
+def test_a_model_with_a_memory_is_refused():
+    with pytest.raises(ValueError, match=r"the memory of the model of .*hrmapnet.* would be empty"):
+        overfit(read_config("hrmapnet_r18_minicity"), 1, 300)

@@ -93,6 +93,18 @@ def test_only_sure_predictions_are_drawn():
     assert not raster[:2].any()
 
 
+def test_scores_are_those_of_the_coder():
+    """With sigma_power, an element is drawn if its weighted score is above the threshold."""
+    head = {**small_config()["map_head"], "type": "GSMapHead", "coder": {"sigma_power": 2.0}}
+    model = build_small(map_head=head, prior={**PRIOR, "score_threshold": 0.4}).eval()
+    (sample,) = predict(model, frames(("town", "a", 0.0)))
+    found = sample.pred_instances_3d
+    (pending,) = model.prior._pending
+    best = model.map_head.coder.decode(pending.scores.read()[0], pending.points_m.read()[0])
+    torch.testing.assert_close(best.scores, found.scores_3d)
+    assert window_of(model).any() == (found.scores_3d > 0.4).any()
+
+
 def test_windows_of_fixed_sizes_give_equal_features_and_queries():
     """A prediction selects cells on the host; an exported model masks all cells."""
     model = prior_model().eval()
@@ -234,6 +246,9 @@ def test_a_model_without_its_parts_is_refused():
         RasterPrior(Pivot(), model.bev_encoder)
     with pytest.raises(ValueError, match="NoneType can have no prior, which needs a BEV encoder"):
         RasterPrior(model.map_head, None)
+    model.map_head.bev_dims *= 2
+    with pytest.raises(ValueError, match=r"MapHead can have no RasterPrior, .* have 16, .* 32"):
+        RasterPrior(model.map_head, model.bev_encoder)
 
 
 def test_an_encoder_with_another_order_of_rows_can_have_a_prior():

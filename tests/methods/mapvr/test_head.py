@@ -45,6 +45,12 @@ def test_each_part_can_be_switched_off():
     assert head.losses["pts"].loss_weight == head.assigner.match_costs[1].weight == 5.0
 
 
+def test_a_loss_that_a_config_has_removed_is_none():
+    head = build_head(MAPVR, losses=[{"type": "PointsLoss"}, None], points_weight=5.0)
+    assert "pts" in head.losses
+    assert head.losses["pts"].loss_weight == 5.0
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

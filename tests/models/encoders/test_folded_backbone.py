@@ -100,6 +100,22 @@ def test_a_config_can_leave_the_backbone_as_it_is():
     assert model.folded_backbone is None
 
 
+def test_a_training_by_a_fused_optimizer_is_followed() -> None:
+    """It changes weights, but not their versions; a replayed graph does not call the backbone."""
+    model = build_small(img_neck=None).eval()
+    with torch.no_grad():
+        model.extract_img_feats(IMAGES[None])
+    model.train()
+    weights = list(model.img_backbone.parameters())
+    for weight in weights:
+        weight.grad = torch.ones_like(weight)
+    torch.optim.AdamW(weights, lr=0.1, fused=True).step()
+    model.eval()
+    with torch.no_grad():
+        feats = model.extract_img_feats(IMAGES[None])
+        assert_same([level[0] for level in feats], model.img_backbone(IMAGES))
+
+
 @torch.no_grad()
 def test_a_backbone_with_deformable_convolutions_is_not_folded_nor_fed_channels_last():
     """mmcv folds their norm into another convolution, and reads channels last as first."""

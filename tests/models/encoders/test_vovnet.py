@@ -45,11 +45,21 @@ def test_block_aggregates_its_input_and_every_layer_and_gates_channels():
 
 
 def test_frozen_parts_stay_frozen_in_training():
-    model = VoVNet(19, frozen_stages=1).train()
-    frozen = {name.split(".")[0] for name, p in model.named_parameters() if not p.requires_grad}
-    assert frozen == {"stem", "stage2"}
+    model = VoVNet(19, frozen_stages=1)
+    for _ in range(2):  # also before the first `train`, when optimizers collect weights
+        trained = {name.split(".")[0] for name, p in model.named_parameters() if p.requires_grad}
+        assert trained == {"stage3", "stage4", "stage5"}
+        model.train()
     assert not any(m.training for m in model.modules() if isinstance(m, torch.nn.BatchNorm2d))
     assert all(p.requires_grad for p in VoVNet(19).train().parameters())
+
+
+def test_fixed_statistics_stay_fixed_in_sync_bn():
+    model = VoVNet(19, norm_eval=True, frozen_stages=-1)
+    model = torch.nn.SyncBatchNorm.convert_sync_batchnorm(model).train()
+    norms = [m for m in model.modules() if isinstance(m, torch.nn.SyncBatchNorm)]
+    assert norms
+    assert not any(norm.training for norm in norms)
 
 
 @pytest.mark.parametrize(

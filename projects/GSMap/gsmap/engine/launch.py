@@ -7,17 +7,18 @@ import logging
 import os
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from mmdet3d.registry import DATA_SAMPLERS, OPTIMIZERS, RUNNERS
+from mmdet3d.registry import DATA_SAMPLERS, LOOPS, OPTIMIZERS, RUNNERS
 from mmengine.config import Config
 from mmengine.logging import print_log
 from mmengine.registry import Registry, init_default_scope
+from mmengine.runner import IterBasedTrainLoop
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.checkpoints.building import reading_config
@@ -276,12 +277,13 @@ def check_config(cfg: Config) -> None:
             type. The optimizer, runner or backend does not exist. The pipeline lacks a transform
             that the head needs, or settings of this transform contradict the head. The sampler of a
             temporal model does not keep the order of frames, or the batch size of its training is
-            not the number of streams.
+            not the number of streams. A model with a memory is trained by iterations.
     """
     check_targets(cfg)  # transforms that compute the targets of the head
     _check_lengths(cfg)
     _check_backend(cfg)
     _check_streams(cfg)
+    _check_memory_loop(cfg)
     _check_schedule(cfg)
     optimizer = (cfg.get("optim_wrapper") or {}).get("optimizer") or {}
     # Without this check, mmengine would build a run without an optimizer.
@@ -442,6 +444,40 @@ def _check_keys(cfg: Config) -> None:
         raise InputError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
 
 
+def _has_trained_stream_memory(temporal: Mapping[str, Any]) -> bool:
+    """Whether a temporal model is trained with its memory: one of map elements alone is not."""
+    return temporal.get("bev") is not None or temporal.get("queries") is not None
+
+
+def has_trained_memory(cfg: Config) -> bool:
+    """Whether the model of a config remembers earlier frames or a map of them in training."""
+    model = cfg.get("model") or {}
+    if _has_trained_stream_memory(model.get("temporal") or {}):
+        return True
+    prior_class = class_of_type((model.get("prior") or {}).get("type"))
+    return getattr(prior_class, "reads_window", False)
+
+
+def _check_memory_loop(cfg: Config) -> None:
+    """Require a loop of epochs if the model has a memory in training.
+
+    A loop of iterations sets the training mode before each iteration, and a change of the mode
+    empties the memory.
+    """
+    settings = cfg.get("train_cfg") or {}
+    kind = settings.get("type")
+    by_iterations = not settings.get("by_epoch", True)
+    if kind is not None:
+        loop_class = class_of_type(kind, registry=LOOPS) or object
+        by_iterations = issubclass(loop_class, IterBasedTrainLoop)
+    if by_iterations and has_trained_memory(cfg):
+        raise InputError(
+            f"{cfg.filename}: train_cfg counts iterations, in which the memory of the model "
+            "(model.temporal or model.prior) would be empty: set train_cfg to "
+            "dict(type='EpochBasedTrainLoop', max_epochs=...)."
+        )
+
+
 def _check_streams(cfg: Config) -> None:
     """Require samplers that keep the frames of each scene in order if the model is temporal.
 
@@ -451,8 +487,7 @@ def _check_streams(cfg: Config) -> None:
     if temporal is None:
         return
     samplers = {"val": "StreamTestSampler", "test": "StreamTestSampler"}
-    has_trained_memory = temporal.get("bev") is not None or temporal.get("queries") is not None
-    if has_trained_memory:  # a memory of map elements alone is not trained
+    if _has_trained_stream_memory(temporal):
         samplers["train"] = "StreamTrainSampler"
     for split, needed_sampler in samplers.items():
         loader = cfg.get(f"{split}_dataloader") or {}

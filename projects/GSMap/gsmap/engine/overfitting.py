@@ -2,6 +2,7 @@
 
 from mmengine.config import Config
 
+from gsmap.engine.launch import has_trained_memory
 from gsmap.utils.errors import InputError
 
 LOG_LINES = 10  # number of times that a run logs its losses
@@ -38,6 +39,11 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
         raise InputError(
             f"--overfit takes samples one by one, but train_dataloader.sampler of {cfg.filename} "
             f"is a {sampler}: take a config of a model without memory."
+        )
+    if has_trained_memory(cfg):
+        raise InputError(
+            f"--overfit counts iterations, in which the memory of the model of {cfg.filename} "
+            "would be empty: take a config of a model without memory."
         )
     # This sampler repeats the samples without end, which suits a training that counts iterations.
     loader.sampler = {"type": "InfiniteSampler", "shuffle": True}

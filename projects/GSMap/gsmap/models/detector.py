@@ -21,7 +21,7 @@ from gsmap.models.encoders.folded_backbone import FoldedBackbone
 from gsmap.models.encoders.fused_resnet import FrozenNorms, has_frozen_norms
 from gsmap.models.encoders.half_backbone import HalfBackbone
 from gsmap.models.loss_check import LossCheck
-from gsmap.models.step_graphs import SWITCH, StepGraphs, reason_against_recording
+from gsmap.models.step_graphs import StepGraphs, require_recordable
 from gsmap.models.streams.memory import BatchMemory, StreamMemory
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32, is_recording
@@ -140,13 +140,14 @@ class MapDetector(Base3DDetector):
             self.prior = MODELS.build({"head": self.map_head, "encoder": self.bev_encoder, **prior})
         self.step_graphs: StepGraphs | None = None
         if cuda_graphs:  # `SWITCH` is the name of this argument
-            if reason := reason_against_recording(self):
-                raise InputError(f"{SWITCH}=True does not go with this model: {reason}.")
+            require_recordable(self)
             self.step_graphs = StepGraphs()
 
     def train(self, mode: bool = True) -> "MapDetector":
         """Set the mode. If ``compiled`` is set, the first call with True compiles the modules."""
         super().train(mode)
+        if mode:
+            self._drop_backbone_copies()
         if mode and self.compiled:
             compile_mode = None if self.compiled is True else self.compiled
             parts = (
@@ -162,10 +163,23 @@ class MapDetector(Base3DDetector):
             self.compiled = False  # so that a later call does not compile the modules again
         return self
 
+    def _drop_backbone_copies(self) -> None:
+        """Delete the copies of the backbone for inference before its weights are trained.
+
+        The copies are made again if the versions of the weights have changed, but a fused optimizer
+        changes weights without their versions.
+        """
+        if self.folded_backbone is not None:
+            self.folded_backbone.folded = None
+        if self.half_backbone is not None:
+            self.half_backbone.backbone = None
+
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
         """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
         if self.img_backbone is None:
             raise InputError("the model has no img_backbone, so it takes no images.")
+        if torch.is_grad_enabled():
+            self._drop_backbone_copies()
         images = imgs.flatten(0, 1)
         if self.half_backbone is not None and not torch.is_grad_enabled():
             maps = self.half_backbone(

@@ -27,6 +27,16 @@ _MOST_SIZES = 4  # largest number of recordings; each occupies the memory of a s
 _WARM_UP = 3  # steps before a recording, in which libraries select and load kernels
 
 
+def require_recordable(model: Any) -> None:
+    """Require that the training steps of a model can be recorded.
+
+    Raises:
+        ValueError: If they cannot; the message has the reason.
+    """
+    if reason := reason_against_recording(model):
+        raise InputError(f"{SWITCH}=True does not go with this model: {reason}.")
+
+
 def reason_against_recording(model: Any) -> str:
     """Reason why the training steps of a model cannot be recorded.
 
@@ -165,8 +175,8 @@ class StepGraphs:
 
         Raises:
             RuntimeError: If a step of this size cannot be recorded.
-            ValueError: If autocast is enabled around the model, or if, on a GPU, gradients of an
-                earlier step have not been set to None.
+            ValueError: If the model has parts that cannot be recorded, if autocast is enabled
+                around it, or if, on a GPU, gradients of an earlier step have not been set to None.
         """
         if torch.is_autocast_enabled(images.device.type):
             # Autocast caches weights cast to half precision: all later steps would use the cached
@@ -175,6 +185,9 @@ class StepGraphs:
                 f"{SWITCH}=True does not go with --amp: leave it out, and set "
                 "model.autocast=bfloat16."
             )
+        # The batch norms may have been replaced after the model was built (`sync_bn` of a config).
+        if not self._recordings:
+            require_recordable(model)
         inputs = [images, *calibration.values()]
         if not images.is_cuda:
             step = StaticStep(model)

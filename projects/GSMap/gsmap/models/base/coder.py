@@ -114,6 +114,11 @@ class MapCoder:
             keep &= scores > self.score_threshold
         return keep
 
+    @property
+    def weighs_scores(self) -> bool:
+        """Whether `weigh_scores` changes scores."""
+        return False
+
     def weigh_scores(self, scores: Tensor, fields: Tensors) -> Tensor:
         """Class logits for the selection of detections; a subclass may change them here.
 

@@ -109,6 +109,7 @@ class MapHead(LossHead):
         self.classes = tuple(classes)
         self.num_points = num_points
         self.embed_dims = embed_dims
+        self.bev_dims = embed_dims  # a subclass may have other channels in its queries
         self.masks = ElementMasks.of(grid, masks)
         self.query_groups = [QueryGroup(**group) for group in query_groups]
         num_instances = sum(group.num for group in self.query_groups)

@@ -66,15 +66,15 @@ def build_part(settings: Mapping[str, Any] | None, **defaults: Any) -> Any:
     return MODELS.build(with_defaults(settings, **defaults))
 
 
-def class_of(part: Mapping[str, Any], registry: Registry = MODELS) -> type | None:
+def class_of(part: Mapping[str, Any] | None, registry: Registry = MODELS) -> type | None:
     """Class that a config builds, or None if it has no type or a name that is not registered.
 
     Args:
         part: Config. Its ``type`` is a class, or the name of a class with or without the scope of
-            its registry.
+            its registry. None, for a part that another config has removed, has no class.
         registry: Registry in which names are looked up.
     """
-    kind = part.get("type")
+    kind = part.get("type") if part else None
     return registry.get(kind) if isinstance(kind, str) else kind  # `get` returns None if unknown
 
 

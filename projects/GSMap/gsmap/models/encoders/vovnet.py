@@ -155,6 +155,9 @@ class VoVNet(BaseModule):
                 stage.add_module(name, block)
                 in_channels = out_channels
             self.add_module(f"stage{number}", stage)
+        # Before the first `train`, because optimizers and DistributedDataParallel collect the
+        # trained weights earlier.
+        self._freeze()
 
     @property
     def stages(self) -> tuple[nn.Sequential, ...]:
@@ -174,12 +177,16 @@ class VoVNet(BaseModule):
     def train(self, mode: bool = True) -> "VoVNet":
         """Set the training mode; frozen modules stay in evaluation mode."""
         super().train(mode)
+        self._freeze()
+        if self.norm_eval:
+            for module in self.modules():
+                if isinstance(module, nn.modules.batchnorm._BatchNorm):  # also SyncBN
+                    module.eval()
+        return self
+
+    def _freeze(self) -> None:
+        """Keep the stages of ``frozen_stages`` in evaluation mode and without gradients."""
         parts = (self.stem, *self.stages)
         num_frozen = self.frozen_stages + 1  # with the stem
         for part in parts[:num_frozen]:
             part.eval().requires_grad_(False)
-        if self.norm_eval:
-            for module in self.modules():
-                if isinstance(module, nn.BatchNorm2d):
-                    module.eval()
-        return self

@@ -32,6 +32,11 @@ class GaussianCoder(MapCoder):
             raise InputError(f"sigma_power must be >= 0, got {sigma_power}.")
         self.sigma_power = sigma_power
 
+    @property
+    def weighs_scores(self) -> bool:
+        """Whether `weigh_scores` changes scores."""
+        return self.sigma_power > 0
+
     def weigh_scores(self, scores: Tensor, fields: Tensors) -> Tensor:
         """Add the preference for small sigmas to class logits, before detections are selected.
 

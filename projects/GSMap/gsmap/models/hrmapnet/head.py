@@ -12,6 +12,7 @@ from gsmap.models.base.head import MapHead
 from gsmap.models.base.layers import init_matrices, mlp
 from gsmap.models.base.parts import PartConfig
 from gsmap.models.base.queries import PointTable
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -96,6 +97,15 @@ class HRMapNetHead(MapHead):
         reference: Any = self.reference
         out_dims = reference.initial.out_features
         reference.initial = mlp(embed_dims, embed_dims, embed_dims, out_dims)
+
+    def _build_point_embedding(self, config: PartConfig | None) -> nn.Module | None:
+        """Build the embeddings of `MapHead`, and refuse a config of others."""
+        if config is not None:
+            raise InputError(
+                "HRMapNetHead has embeddings of points of half the channels: leave out "
+                "point_queries and points_from_instances."
+            )
+        return super()._build_point_embedding(config)
 
     def init_weights(self) -> None:
         """Initialise the head as `MapHead` does, and the network of the first references."""

@@ -162,8 +162,15 @@ class PriorHook(FlowHook):
         last = layers[-1]
         num_instances = head.query_groups[0].num  # the first group predicts
         points_m = head.reference.metres(last.pts[:, :num_instances].detach().float())
+        scores = last.scores[:, :num_instances].detach()
+        if head.coder.weighs_scores:
+            weighted_scores = []
+            for references, logits in zip(last.references.detach(), scores, strict=True):
+                fields = head.reference.decode(references[:num_instances])
+                weighted_scores.append(head.coder.weigh_scores(logits, fields))
+            scores = torch.stack(weighted_scores)
         # A `LateValues` copies in the background: the host waits only when the values are read.
-        self.scores = LateValues(last.scores[:, :num_instances].float())
+        self.scores = LateValues(scores.float())
         self.points_m = LateValues(points_m[..., :2])  # without heights
         return layers
 

@@ -120,6 +120,11 @@ class RasterPrior(PriorModule, AddsWeights):
                 f"{type(encoder).__name__} can have no prior, which needs a BEV encoder of one "
                 "level of images with cells of a fixed size."
             )
+        if head.bev_dims != head.embed_dims:
+            raise InputError(
+                f"{type(head).__name__} can have no RasterPrior, whose layers have one number of "
+                f"channels: its queries have {head.embed_dims}, the BEV features {head.bev_dims}."
+            )
         if bev is None and queries is None:
             raise InputError("prior needs bev, queries or both, such as bev=dict().")
         if not 0 <= train_drop < 1:
@@ -365,7 +370,7 @@ class RasterPrior(PriorModule, AddsWeights):
         """Draw the predictions of a frame whose scores are high enough.
 
         Args:
-            scores: Class logits. (N, classes)
+            scores: Class logits, as the coder weighs them. (N, classes)
             points_m: Points in metres. (N, P, 2)
 
         Returns:

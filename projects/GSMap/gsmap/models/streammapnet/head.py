@@ -61,6 +61,7 @@ class StreamMapNetHead(MapHead):
             embed_dims=2 * embed_dims,
             **kwargs,
         )
+        self.bev_dims = embed_dims
         num_queries = sum(group.num for group in self.query_groups)
         self.instance_embedding = nn.Embedding(num_queries, self.embed_dims)
         branch = nn.Linear(self.embed_dims, len(self.classes))
