@@ -182,7 +182,6 @@ def test_several_devices_and_mixed_precision_keep_order_and_values(inferencer, t
     pair = MapInferencer(make_config(), None, device=["cpu", "cpu"])
     pair.replicas[1].load_state_dict(inferencer.model.state_dict())
     pair.replicas[0].load_state_dict(inferencer.model.state_dict())
-    pair._camera_embeds = inferencer._camera_embeds
     alone, together = inferencer(samples, tmp_path), pair(samples, tmp_path)
     assert [s.metainfo["token"] for s in together] == ["t0", "t1", "t2"]
     for a, b in zip(alone, together, strict=True):
@@ -217,6 +216,31 @@ def test_cameras_of_other_names_and_number_take_the_embeddings_of_their_directio
     samples[0].cameras = [front, back]
     (again,) = inferencer(samples, tmp_path)
     torch.testing.assert_close(again.pred_instances_3d.pts, usual.pred_instances_3d.pts)
+
+
+def test_rigs_may_take_turns_and_leave_the_model_as_it_is(inferencer, tmp_path):
+    rigs = [make_samples(tmp_path, 3), make_samples(tmp_path, 3)]
+    for sample in rigs[1]:
+        front, back = sample.cameras
+        sample.cameras = [replace(back, name="rear"), replace(front, name="windscreen")]
+    datasets = [inferencer.dataset(samples, tmp_path) for samples in rigs]
+    weights = {name: value.clone() for name, value in inferencer.model.state_dict().items()}
+    alone = [list(inferencer.predict(dataset)) for dataset in datasets]
+    versions = []
+    embeds = inferencer.model.bev_encoder.cams_embeds
+    hook = inferencer.model.bev_encoder.register_forward_pre_hook(
+        lambda module, _: versions.append((id(module.cams_embeds), module.cams_embeds._version))
+    )
+    together = zip(*map(inferencer.predict, datasets), strict=True)
+    for turn, samples in enumerate(together):
+        for rig, sample in enumerate(samples):
+            expected = alone[rig][turn].pred_instances_3d
+            assert torch.equal(sample.pred_instances_3d.pts, expected.pts)
+    hook.remove()
+    assert len(set(versions)) == 2  # recorded frames of each rig can be replayed
+    assert inferencer.model.bev_encoder.cams_embeds is embeds
+    for name, value in inferencer.model.state_dict().items():
+        assert torch.equal(value, weights[name])
 
 
 def test_samples_of_another_frame_are_seen_from_the_model_s(inferencer, tmp_path):

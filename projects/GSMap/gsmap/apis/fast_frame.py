@@ -187,7 +187,8 @@ class FastFrames:
     frame: StaticFrame
     device: torch.device
     capture: bool = True
-    # Recordings by the shapes and types of the inputs; the least recently used one is first.
+    # Recordings by camera embeddings, and shapes and types of the inputs. The least recently used
+    # one is first.
     _graphs: "OrderedDict[Any, _Recording]" = field(default_factory=OrderedDict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -262,7 +263,9 @@ class FastFrames:
         if not self.capture:
             on_device = [tensor.to(self.device) for tensor in inputs]
             return self.frame(*on_device).cpu()
-        key = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
+        # The recording of one rig stays while frames of another one are predicted.
+        cams_embeds = getattr(self.frame.model.bev_encoder, "cams_embeds", None)
+        key = (id(cams_embeds), *((tensor.shape, tensor.dtype) for tensor in inputs))
         while True:
             recording = self._graphs.get(key)
             if recording is None:
@@ -281,7 +284,7 @@ class FastFrames:
         """Record a frame with the sizes of the inputs.
 
         Args:
-            key: Shapes and types of the inputs, the key of the recording.
+            key: Camera embeddings, and shapes and types of the inputs: the key of the recording.
             inputs: Images and calibration arrays.
 
         Raises:

@@ -3,10 +3,11 @@
 import copy
 import logging
 import tempfile
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -161,9 +162,11 @@ class MapInferencer:
             self.replicas.append(replica)
             fast_frames = self._build_fast_frames(replica, device=target, cuda_graphs=cuda_graphs)
             self._fast_frames.append(fast_frames)
-        # Camera embeddings as trained, one row per camera of the model; None for a model without.
-        # `_fit_cameras` replaces them in the replicas, so the original is kept here.
-        self._camera_embeds = getattr(self.model.bev_encoder, "cams_embeds", None)
+        # A step changes state of the replica for the time of the step: memory, prior, embeddings.
+        self._locks = [threading.Lock() for _ in self.replicas]
+        # Embeddings of other rigs by replica, rows (`camera_rows`), and address and version of the
+        # trained ones. They are kept because `FastFrames` records frames again if a weight moves.
+        self._rig_embeds: dict[Any, torch.nn.Parameter] = {}
         self.visualizer = _build_visualizer(self.cfg)
         # Folder of the annotation files that `dataset` writes, and the number of these files.
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
@@ -252,19 +255,20 @@ class MapInferencer:
 
     def _fit_cameras(
         self, dataset: "VectorizedMapDataset", allow_missing_cameras: bool
-    ) -> "VectorizedMapDataset":
-        """Select the camera embedding of each camera of a data set (`camera_rows`).
+    ) -> "tuple[VectorizedMapDataset, list[int] | None]":
+        """Find the trained camera that each camera of a data set is treated as (`camera_rows`).
 
         Args:
             dataset: The data set.
             allow_missing_cameras: Whether cameras that no sample has are left out.
 
         Returns:
-            The data set, without cameras that are left out.
+            The data set, without cameras that are left out, and for each of its cameras the index
+            of the trained camera; None for a model without embeddings of cameras.
         """
         trained = self.cfg.test_dataloader.dataset.get("cameras")
         if trained is None or dataset.cameras is None:
-            return dataset
+            return dataset, None
         if allow_missing_cameras:
             available: set[str] = set()  # cameras that a sample or more has
             for index in range(len(dataset)):
@@ -274,16 +278,34 @@ class MapInferencer:
             if cameras:
                 dataset = copy.copy(dataset)  # the caller's data set keeps its cameras
                 dataset.cameras = cameras
-        if self._camera_embeds is None:
-            return dataset
+        if getattr(self.model.bev_encoder, "cams_embeds", None) is None:
+            return dataset, None
         from gsmap.apis.rig_fit import camera_rows
 
-        # For each camera of the data set, the index of the trained camera that it is treated as.
-        rows = camera_rows(dataset, trained=trained)
-        for replica, device in zip(self.replicas, self.devices, strict=True):
-            embeds = self._camera_embeds.detach()[rows].to(device)  # (V, C)
-            replica.bev_encoder.cams_embeds = torch.nn.Parameter(embeds)
-        return dataset
+        return dataset, camera_rows(dataset, trained=trained)
+
+    @contextmanager
+    def _embeddings_of(self, turn: int, rows: list[int] | None) -> "Iterator[None]":
+        """Context manager in which a replica has the embeddings of other cameras.
+
+        Args:
+            turn: Index of the replica.
+            rows: For each camera the index of the trained camera; None for the trained cameras.
+        """
+        encoder = self.replicas[turn].bev_encoder
+        if rows is None or rows == list(range(len(encoder.cams_embeds))):
+            yield
+            return
+        trained = encoder.cams_embeds
+        version = 0 if trained.is_inference() else trained._version
+        key = (turn, tuple(rows), trained.data_ptr(), version)
+        if key not in self._rig_embeds:
+            self._rig_embeds[key] = torch.nn.Parameter(trained.detach()[rows])  # (V, C)
+        encoder.cams_embeds = self._rig_embeds[key]
+        try:
+            yield
+        finally:
+            encoder.cams_embeds = trained
 
     @staticmethod
     def lidar_points(dataset: "VectorizedMapDataset", index: int) -> np.ndarray | None:
@@ -362,7 +384,7 @@ class MapInferencer:
         elif self.model.temporal is not None:
             stream = self._temporal().new_scenes()  # a memory for each scene of the samples
         maps = self._maps(priors, update=update_priors)
-        dataset = self._fit_cameras(dataset, allow_missing_cameras=allow_missing_cameras)
+        dataset, rows = self._fit_cameras(dataset, allow_missing_cameras=allow_missing_cameras)
         frames = FrameDataset(dataset, blank_cameras=allow_missing_cameras)
         subset = frames if indices is None else Subset(frames, indices=indices)
         batches = DataLoader(
@@ -383,7 +405,7 @@ class MapInferencer:
                     # A signal handler that raises here could leave a lock of the pool locked.
                     with delay_signals():
                         future = pools[turn].submit(
-                            self._step, turn=turn, batch=batch, stream=stream, maps=maps
+                            self._step, turn=turn, batch=batch, rows=rows, stream=stream, maps=maps
                         )
                         pending.append(future)
                 if len(pending) > num_ahead:
@@ -438,13 +460,19 @@ class MapInferencer:
 
     @torch.no_grad()
     def _step(
-        self, turn: int, batch: dict[str, Any], stream: Any = None, maps: Any = None
+        self,
+        turn: int,
+        batch: dict[str, Any],
+        rows: list[int] | None = None,
+        stream: Any = None,
+        maps: Any = None,
     ) -> "list[Det3DDataSample]":
         """Predict a batch on one device.
 
         Args:
             turn: Index of the device, and of its replica.
             batch: ``inputs`` and ``data_samples``, as `collate` returns them.
+            rows: Index of the trained camera for each camera, as `_fit_cameras` returns them.
             stream: Drive or scenes of the samples, for a model with memory.
             maps: Maps that the samples read, for a model with a prior.
 
@@ -454,20 +482,21 @@ class MapInferencer:
         model = self.replicas[turn]
         device_type = self.devices[turn].type
         fast_frames = self._fast_frames[turn]
-        if fast_frames is not None and fast_frames.serves(batch):
-            return fast_frames(batch)  # such a model has neither a memory nor a prior
-        # In these contexts, the model uses the caller's memory and maps in place of those it has.
-        memory = nullcontext() if stream is None else self.model.temporal.using(stream)
-        prior = nullcontext() if maps is None else self.model.prior.using(maps)
-        in_bfloat16 = self.amp and device_type == "cpu"
-        # `half_backbone` is only set for mixed precision on a GPU (`_build_fast_frames`).
-        with (
-            memory,
-            prior,
-            matrix_products(in_tf32=model.half_backbone is not None),
-            torch.autocast(device_type, enabled=in_bfloat16),
-        ):
-            return [sample.cpu() for sample in model.test_step(batch)]
+        with self._locks[turn], self._embeddings_of(turn, rows):
+            if fast_frames is not None and fast_frames.serves(batch):
+                return fast_frames(batch)  # such a model has neither a memory nor a prior
+            # In these contexts, the model uses the caller's memory and maps in place of its own.
+            memory = nullcontext() if stream is None else self.model.temporal.using(stream)
+            prior = nullcontext() if maps is None else self.model.prior.using(maps)
+            in_bfloat16 = self.amp and device_type == "cpu"
+            # `half_backbone` is only set for mixed precision on a GPU (`_build_fast_frames`).
+            with (
+                memory,
+                prior,
+                matrix_products(in_tf32=model.half_backbone is not None),
+                torch.autocast(device_type, enabled=in_bfloat16),
+            ):
+                return [sample.cpu() for sample in model.test_step(batch)]
 
     def predict_images(
         self,
