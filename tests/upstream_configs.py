@@ -177,11 +177,11 @@ def maptr(**settings: object) -> str:
     return TEMPLATE.format(**(NUSCENES | values | settings))
 
 
-def maptr_av2() -> str:
+def maptr_av2(range_m: str = "[-30.0, -15.0, -2.0, 30.0, 15.0, 2.0]") -> str:
     """MapTR on Argoverse 2."""
     encoder = KERNEL.format(dropout=0.1).replace("pc_range=range_m, emb", "num_cams=7, emb")
     return maptr(
-        range_m="[-30.0, -15.0, -2.0, 30.0, 15.0, 2.0]", rows=100, cols=200, root="data/av2/",
+        range_m=range_m, rows=100, cols=200, root="data/av2/",
         limits="[-35, -20, -35, -20, 35, 20, 35, 20]", dataset="CustomAV2LocalMapDataset",
         cameras="num_cams=7,", scale=0.3, batch=6, epochs=6, encoder=encoder,
     )  # fmt: skip

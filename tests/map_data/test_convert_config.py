@@ -108,6 +108,23 @@ def test_settings_of_ones_own_arrive(tmp_path):
     assert cfg.optim_wrapper.loss_scale == 512
 
 
+@pytest.mark.parametrize(("x_m", "y_m"), [(30.0, 15.0), (15.0, 30.0), (50.0, 25.0)])
+def test_the_data_set_is_the_one_of_the_type_at_any_range(x_m, y_m, tmp_path):
+    range_m = f"[-{x_m}, -{y_m}, -2.0, {x_m}, {y_m}, 2.0]"
+    templates = {"nuscenes": upstream_configs.maptr, "av2": upstream_configs.maptr_av2}
+    for data_set, template in templates.items():
+        cfg, _ = converted(template(range_m=range_m), tmp_path)
+        assert cfg.train_dataloader.dataset.ann_file == f"gsmap_{data_set}_train.arrow"
+        assert cfg.model.grid == {"x_range": [-x_m, x_m], "y_range": [-y_m, y_m]}
+
+
+def test_another_data_set_of_validation_is_named(tmp_path):
+    other = "**{**shared, 'type': 'CustomAV2LocalMapDataset'}"
+    text = upstream_configs.maptr().replace("_gpu=1, **shared", f"_gpu=1, {other}")
+    _, unplaced = converted(text, tmp_path)
+    assert unplaced == [BASE, "data.val.type = 'CustomAV2LocalMapDataset'"]
+
+
 def test_what_has_no_place_is_named_with_its_value(tmp_path):
     collect = "dict(type='CustomCollect3D"
     text = (
@@ -229,7 +246,7 @@ def test_maptr_on_depth_pooled_features_stays_maptr(tmp_path):
     assert shapes[0] == shapes[1]
     assert models[0].bev_encoder.camera_aware is False
     assert unplaced == [BASE]
-    settings |= {"range_m": "[-30.0, -15.0, -5.0, 30.0, 15.0, 3.0]", "rows": 100, "cols": 200}
+    settings["dataset"] = "CustomAV2OfflineLocalMapDataset"
     with pytest.raises(ValueError, match="LSSTransform of MapTR is not supported on Argoverse 2"):
         converted(upstream_configs.maptr(**settings), tmp_path)
 

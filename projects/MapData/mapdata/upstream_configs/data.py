@@ -10,11 +10,13 @@ from typing import Any
 from gsmap.utils.errors import InputError
 from mapdata.upstream_configs.fields import Fields
 
-# Classes of data sets that are supported, upstream's names.
-DATASETS = (
-    "CustomNuScenesLocalMapDataset", "CustomNuScenesOfflineLocalMapDataset",
-    "CustomAV2LocalMapDataset", "CustomAV2OfflineLocalMapDataset",
-)  # fmt: skip
+# Data sets that are supported, by upstream's names of their classes.
+DATASETS = {
+    "CustomNuScenesLocalMapDataset": "nuScenes",
+    "CustomNuScenesOfflineLocalMapDataset": "nuScenes",
+    "CustomAV2LocalMapDataset": "Argoverse 2",
+    "CustomAV2OfflineLocalMapDataset": "Argoverse 2",
+}
 # Types of pipeline steps that GSMap does elsewhere (migration.md), or that only concern 3D boxes.
 KNOWN_STEPS = {
     "LoadMultiViewImageFromFiles", "CustomLoadMultiViewImageFromFiles",
@@ -24,7 +26,7 @@ KNOWN_STEPS = {
 }  # fmt: skip
 # Names of settings that annotation files contain, or that only concern history and 3D boxes.
 FILE_SETTINGS = (
-    "type ann_file map_ann_file classes modality test_mode use_valid_flag bev_size "
+    "ann_file map_ann_file classes modality test_mode use_valid_flag bev_size "
     "eval_use_same_gt_sample_num_flag padding_value queue_length box_type_3d samples_per_gpu "
     "load_interval aux_seg fixed_ptsnum_per_line"
 )
@@ -52,8 +54,9 @@ def data_settings(fields: Fields) -> dict[str, Any]:
     Returns:
         Settings by dotted name in GSMap, and further entries for the conversion of the model:
         ``grid`` (``x_range`` and ``y_range``) and ``z_range`` in metres, ``classes``,
-        ``data_root``, ``steps`` (settings of GSMap's pipeline steps by type) and ``with_depth``
-        (whether the pipeline collects depth maps).
+        ``data_root``, ``data_set`` (``nuScenes`` or ``Argoverse 2``), ``steps`` (settings of
+        GSMap's pipeline steps by type) and ``with_depth`` (whether the pipeline collects depth
+        maps).
 
     Raises:
         ValueError: If the data set is unknown, a required setting is missing, or a pipeline is not
@@ -78,6 +81,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         "train_dataloader.batch_size": fields.take("data.samples_per_gpu"),
         "train_dataloader.num_workers": fields.take("data.workers_per_gpu"),
         "data_root": data_root,
+        "data_set": DATASETS[train["type"]],
         "z_range": [pc_range[2], pc_range[5]],
         "steps": {
             "FormatMapTargets": {"num_points": train["fixed_ptsnum_per_line"]},
@@ -96,7 +100,12 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         settings[f"{dataset}.classes"] = classes
         settings[f"{dataset}.data_root"] = fields.take(f"{section}.data_root", default=data_root)
         fields.drop(
-            section, names=FILE_SETTINGS, pc_range=pc_range, map_classes=classes, z_cfg=FLAT
+            section,
+            names=FILE_SETTINGS,
+            type=train["type"],
+            pc_range=pc_range,
+            map_classes=classes,
+            z_cfg=FLAT,
         )
         if "pipeline" in fields.section(section):
             # `items` lists the dotted names of the steps, such as `data.train.pipeline.0`.

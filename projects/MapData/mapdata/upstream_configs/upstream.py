@@ -168,11 +168,10 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
     for section in {**IGNORED_NAMES, **FIXED_VALUES}:  # sections of either mapping
         fixed_values = FIXED_VALUES.get(section, {})
         fields.drop(section, names=IGNORED_NAMES.get(section, ""), **fixed_values)
-    has_depth = settings.pop("with_depth")  # selects the base config and is no setting of GSMap
-    # The map of Argoverse 2 has 60 m along x, which is ahead in its frame. The map of nuScenes has
-    # 30 m along x.
-    is_argoverse2 = sides[0] == -30.0
-    base = _base_config(encoder, model=model, is_argoverse2=is_argoverse2, has_depth=has_depth)
+    # These two select the base config and are no settings of GSMap.
+    data_set = settings.pop("data_set")
+    has_depth = settings.pop("with_depth")
+    base = _base_config(encoder, model=model, data_set=data_set, has_depth=has_depth)
     return Conversion(
         base=base,
         settings=settings,
@@ -294,13 +293,13 @@ def _check_type(value: Any, name: str) -> None:
         raise InputError(f"{name} must be the name of a registered class, got {value!r:.60}")
 
 
-def _base_config(encoder: str, model: str, is_argoverse2: bool, has_depth: bool) -> str:
+def _base_config(encoder: str, model: str, data_set: str, has_depth: bool) -> str:
     """Select the GSMap config with this BEV encoder and data set.
 
     Args:
         encoder: Type of the BEV encoder, as `_encoder_settings` returns it.
         model: Type of the original detector, for the error message.
-        is_argoverse2: Whether the data set is Argoverse 2; otherwise it is nuScenes.
+        data_set: ``nuScenes`` or ``Argoverse 2``.
         has_depth: Whether the samples have depth maps.
 
     Returns:
@@ -309,7 +308,6 @@ def _base_config(encoder: str, model: str, is_argoverse2: bool, has_depth: bool)
     Raises:
         ValueError: If no config has this encoder on this data set.
     """
-    data_set = "Argoverse 2" if is_argoverse2 else "nuScenes"
     for entry in _entries("configs"):
         has_encoder = entry["encoder"] == encoder and entry["data_set"] == data_set
         fits_depth = entry.get("depth", has_depth) == has_depth  # without "depth", both fit
