@@ -133,6 +133,25 @@ def test_official_splits_have_one_identity_and_own_ones_that_of_their_file(
     assert found[0].startswith("official@")
 
 
+def test_each_of_several_versions_has_a_list(damaged_root: Path, tmp_path: Path):
+    root = tmp_path / "mixed"
+    *names, last = write_versions(root, damaged_root)
+    lists = {"v1.0-trainval": {"train": names}, "v1.0-test": {"train": [], "val": [last]}}
+    for version, parts in lists.items():
+        (root / version / "splits.json").write_text(json.dumps(parts))
+    options = NuScenesOptions(root, ("v1.0-trainval", "v1.0-test"))
+    convert_nuscenes(options)
+    for part, wanted in (("train", set(names)), ("val", {last})):
+        file = AnnotationFile(root / f"gsmap_nuscenes_{part}.arrow")
+        assert {s.scene for s in file} == wanted
+        assert file.meta.split_list == ""
+    (root / "v1.0-test/splits.json").unlink()  # the official list has other scenes
+    assert f"{len(names)} of the {len(names) + 150} scenes" in convert_nuscenes(options).text()
+    (root / "v1.0-test").rename(root / "own")
+    with pytest.raises(ValueError, match=r"'own' has no official splits: .*own/splits\.json"):
+        convert_nuscenes(replace(options, version=("v1.0-trainval", "own")))
+
+
 def test_an_older_file_has_no_list_and_is_read(tmp_path: Path):
     write_annotations(tmp_path / "old.arrow", META, [sample()])
     assert AnnotationFile(tmp_path / "old.arrow").meta.split_list == ""

@@ -69,7 +69,7 @@ _Scene = tuple[dict[str, Any], NuScenesTables]  # record of a scene, and the tab
 class NuScenesOptions(FileOptions):
     """Options of a conversion of nuScenes-format data (``tools/create_data.py nuscenes``).
 
-    Without ``split_name`` and ``split_file`` the splits are read from
+    Without ``split_name`` and ``split_file`` the splits of each version are read from
     ``<root>/<version>/splits.json`` or, if this file is missing, are the official ones.
 
     Args:
@@ -125,19 +125,25 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
     published_or_file = requested_split(options, "nuscenes")
     if published_or_file is not None:
         return published_or_file, published_or_file.identity
-    splits_path = options.root / options.versions[0] / "splits.json"
-    if splits_path.is_file():
-        return read_split_file(splits_path), ""
     official = create_splits_scenes()
-    scenes = {}
+    scenes: dict[str, list[str]] = {}
+    has_own_list = False
     for version_name in options.versions:
-        if version_name not in _OFFICIAL_SPLITS:
+        splits_path = options.root / version_name / "splits.json"
+        if splits_path.is_file():
+            has_own_list = True
+            parts = read_split_file(splits_path).scenes
+        elif version_name in _OFFICIAL_SPLITS:
+            parts = {part: official[part] for part in _OFFICIAL_SPLITS[version_name]}
+        else:
             raise InputError(
                 f"version {version_name!r} has no official splits: give --split-file, or write "
                 f"{splits_path} (docs/data.md says how)."
             )
-        for part in _OFFICIAL_SPLITS[version_name]:
-            scenes[part] = official[part]
+        for part, names in parts.items():
+            scenes.setdefault(part, []).extend(names)
+    if has_own_list:
+        return SplitList("splits", scenes), ""
     # For every version, the identity is computed from these three splits. The splits of the mini
     # version are subsets of them.
     all_scenes = {part: official[part] for part in ("train", "val", "test")}
