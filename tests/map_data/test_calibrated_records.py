@@ -10,6 +10,7 @@ import pytest
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.source import Mount, change_frame
+from gsmap.utils.shards import Shard
 from mapdata.custom import from_records
 from mapdata.folders.images import read_image_folder
 
@@ -90,6 +91,27 @@ def test_cameras_poses_and_images_are_those_of_infer(drive: Path, frame: str, ca
     moving_m = found[0].cameras[1].cam_from_frame[0, 3]
     standing_m = mount.matrix[0, 3] - 1.2  # right of a camera that looks left is ahead of the car
     np.testing.assert_allclose(moving_m - standing_m, -0.2, atol=1e-6)
+
+
+def test_the_sizes_and_poses_of_a_shard_are_those_of_all_records(drive: Path) -> None:
+    """Poses at the first images of both cameras; the last shard has no image with a pose."""
+    cv2.imwrite(str(drive / f"left/{START_NS + STEP_NS + 20_000_000}.jpg"), np.zeros((9, 16, 3)))
+    rows = ["frame,x,y,z,qw,qx,qy,qz"]
+    for name, north_m in ((START_NS, 0), (START_NS + 20_000_000, 3)):
+        rows.append(f"{name},{EAST_M},{NORTH_M + north_m},30,1,0,0,0")
+    (drive / "poses.csv").write_text("\n".join(rows))
+    file = drive / "calibration.yaml"
+    from_records(drive / "a.arrow", records_of(drive), META, drive, calibration=file)
+    whole = list(AnnotationFile(drive / "a.arrow"))
+    for index in range(3):  # the first of three shards has no record
+        shard = Shard(index, 3)
+        from_records(drive / "b.arrow", records_of(drive), META, drive, shard, calibration=file)
+        part = list(AnnotationFile(shard.path_of(drive / "b.arrow")))
+        for sample, wanted in zip(part, shard.part(whole), strict=True):
+            np.testing.assert_array_equal(sample.global_from_frame, wanted.global_from_frame)
+            for camera, other in zip(sample.cameras, wanted.cameras, strict=True):
+                np.testing.assert_array_equal(camera.cam_from_frame, other.cam_from_frame)
+                assert (camera.width, camera.height) == (other.width, other.height) == (160, 90)
 
 
 def test_a_map_in_grid_coordinates_comes_into_the_frame(drive: Path) -> None:

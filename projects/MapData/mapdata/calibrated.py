@@ -15,6 +15,7 @@ from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.source import Mount, change_frame, ground_from_frame
 from gsmap.utils.errors import InputError
+from gsmap.utils.shards import WHOLE, Shard
 from mapdata.folders.calibration_file import read_vehicle
 from mapdata.folders.rig import RigCamera, RigFrame, rig_samples
 
@@ -23,7 +24,11 @@ _POSE = "global_from_frame"
 
 
 def calibrated_records(
-    records: Sequence[Mapping[str, Any]], file: Path, meta: AnnotationMeta, root: Path
+    records: Sequence[Mapping[str, Any]],
+    file: Path,
+    meta: AnnotationMeta,
+    root: Path,
+    shard: Shard = WHOLE,
 ) -> Iterator[dict[str, Any]]:
     """Add the cameras and the poses of a calibration file to records, the dictionaries of samples.
 
@@ -38,6 +43,8 @@ def calibrated_records(
         meta: Metadata of the annotation file, with the annotation frame and the height of the road
             in it.
         root: Folder that image paths are relative to.
+        shard: Part of the records to yield. The cameras and the poses are those of all records, so
+            that all shards have the same ones.
 
     Yields:
         Records with intrinsics, distortion, ``cam_from_frame``, ``ego_from_frame`` and, if the file
@@ -72,7 +79,7 @@ def calibrated_records(
     # frame from the frame on the road below the vehicle. It returns None if no pose is near the
     # time. Cached, since cameras often share their times.
     pose_at = None if poses is None else cache(poses.at)
-    for number, record in enumerate(records):
+    for number, record in shard.part(list(enumerate(records))):
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             rig_frame = _rig_frame(record, camera_of=camera_of, file=file)
             if pose_at is not None and record.get(_POSE) is not None:

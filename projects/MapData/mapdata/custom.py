@@ -116,11 +116,12 @@ def from_records(
         for record in records:
             tokens.append(str(record.get("token") if isinstance(record, Mapping) else record))
         source = hashlib.sha256("\n".join(tokens).encode()).hexdigest()
-        records = shard.part(records)
     if calibration is not None:
         records = calibrated_records(
-            list(records), Path(calibration), meta=meta, root=Path(data_root)
+            list(records), Path(calibration), meta=meta, root=Path(data_root), shard=shard
         )
+    elif shard.count:
+        records = shard.part(list(records))
     # A generator: samples are checked and written one by one.
     samples = create_samples(records, meta, root=Path(data_root), join=join)
     return write_annotations(path, meta, samples, shard=shard, source=source)
