@@ -1,6 +1,7 @@
 """Own data: the documented example runs, and mistakes are named."""
 
 import json
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -251,9 +252,25 @@ def test_images_of_a_distorted_camera_are_rectified_once(tmp_path: Path):
     first = (tmp_path / seen.path).stat().st_mtime_ns
     from_records(tmp_path / "d.arrow", [distorted], META, tmp_path)
     assert (tmp_path / seen.path).stat().st_mtime_ns == first
-    camera["distortion"] = [-0.2, 0.1, 0, 0]  # another calibration, another folder
+    camera["distortion"] = [-0.2, 0.1, 0, 0]  # another calibration, another file
     from_records(tmp_path / "d.arrow", [distorted], META, tmp_path)
     assert AnnotationFile(tmp_path / "d.arrow")[0].cameras[0].path != seen.path
     camera["distortion"] = [-0.2, 0.1]
     with pytest.raises(ValueError, match="takes 4 or 5 or 8 or 12 or 14 numbers"):
         from_records(tmp_path / "d.arrow", [distorted], META, tmp_path)
+
+
+def test_a_replaced_image_of_a_distorted_camera_is_rectified_again(tmp_path: Path):
+    """Also by an older file; and a missing one is no reason to keep what is there."""
+    size = {"width": 160, "height": 90, "intrinsics": [[100, 0, 80], [0, 100, 45], [0, 0, 1]]}
+    camera = {**record()["cameras"][0], **size, "distortion": [-0.3, 0.1, 0, 0]}
+    image = tmp_path / "a.jpg"
+    for seconds, grey in enumerate((100, 200, 30)):
+        cv2.imwrite(str(image), np.full((90, 160, 3), grey, np.uint8))
+        os.utime(image, (1000 - seconds, 1000 - seconds))
+        from_records(tmp_path / "d.arrow", [record(cameras=[camera])], META, tmp_path)
+        (seen,) = AnnotationFile(tmp_path / "d.arrow")[0].cameras
+        assert cv2.imread(str(tmp_path / seen.path))[45, 80, 0] == pytest.approx(grey, abs=3)
+    image.unlink()
+    with pytest.raises(ValueError, match=r"record 't'.*camera 'front': no image at .*a\.jpg"):
+        from_records(tmp_path / "d.arrow", [record(cameras=[camera])], META, tmp_path)

@@ -330,14 +330,16 @@ def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
         rig_camera.distortion.tolist(),
         rig_camera.model,
     )
-    # The digest in the folder name keeps images that were rectified with another calibration apart.
-    digest = hashlib.sha256(repr(calibration).encode()).hexdigest()[:12]
-    folder = f"rectified/{file_name(rig_camera.name)}-{digest}"
-    path = f"{folder}/{file_name(camera['path'])}.jpg"
+    where = f"camera {rig_camera.name!r}"
+    source = path_below(root, name=camera["path"], noun=f"{where}: the path")
+    # The digest keeps images apart that have another calibration, or whose source was replaced.
+    digest = hashlib.sha256(repr(calibration).encode())
+    if source.is_file():  # `read_image` below raises the error for a missing one
+        digest.update(source.read_bytes())
+    name = f"{file_name(camera['path'])}-{digest.hexdigest()[:12]}.jpg"
+    path = f"rectified/{file_name(rig_camera.name)}/{name}"
     target = root / path
     if not target.is_file():
-        where = f"camera {rig_camera.name!r}"
-        source = path_below(root, name=camera["path"], noun=f"{where}: the path")
         image = read_image(str(source), where, size=rig_camera.size_px)
         target.parent.mkdir(parents=True, exist_ok=True)
         rig_camera.write_image(target, image)
