@@ -249,9 +249,8 @@ class Straight:
 
 def options(tmp_path, **more):
     """Return how a test reads its bag: frames beside it, every image a sample."""
-    return InputOptions(
-        frames_dir=tmp_path / "frames", rate_hz=None, vehicle_ground_z_m=-AXLE_M, **more
-    )
+    values = {"vehicle_ground_z_m": -AXLE_M, **more}
+    return InputOptions(frames_dir=tmp_path / "frames", rate_hz=None, **values)
 
 
 def starting_at_0(drive, turn=0, **more):

@@ -20,7 +20,7 @@ from mapdata.bag_contents import BagContent, read_content, read_messages, stamp_
 from mapdata.bag_files import Bag, bag_at, damage_in
 from mapdata.bag_images import write_image
 from mapdata.bag_poses import PoseChain, odometry_poses
-from mapdata.bag_topics import camera_topics, check_topics, image_topics
+from mapdata.bag_topics import IMAGES, camera_topics, check_topics, image_topics
 from mapdata.folders.calibration_file import read_rig
 from mapdata.folders.rig import (
     RigCamera,
@@ -86,13 +86,13 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     listing = _listing(bag)
     calibration = options.calibration
     notes = list(bag.notes)
-    # Pose of the ground below the vehicle, in the vehicle's frame. (4, 4)
-    ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
     check_topics(kinds, options.topics, listing=listing, needs_info=calibration is None)
     # `topics` has the topic of the images and the topic of the camera info of each camera, by its
     # name. `content` has all messages of the bag except the images: camera info, the tree of
     # frames, odometry, and the times of the images. `rig` has the cameras by their image topic.
+    # `ground` is the pose of the ground below the vehicle, in the vehicle's frame. (4, 4)
     if calibration is None:
+        ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
         topics = options.topics or camera_topics(kinds, listing)
         content = read_content(bag, topics)
         vehicle = _choose_vehicle(content, wanted=options.vehicle_frame)
@@ -101,14 +101,15 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         )
         notes += rig_notes
     else:
-        calibrated_cameras, ground = read_rig(calibration, ground)
+        calibrated_cameras, ground = read_rig(calibration, options.vehicle_ground_z_m)
         topics = _topics_of(calibrated_cameras, options=options, kinds=kinds)
         content = read_content(bag, topics)
         for name, camera_topic_pair in topics.items():
             _require_messages(name, camera_topic_pair, content=content)
-        # Without transforms, poses can only come from odometry, and the vehicle has no frame.
-        has_frames = bool(content.tree.frames)
-        vehicle = _choose_vehicle(content, wanted=options.vehicle_frame) if has_frames else ""
+        if content.tree.frames:
+            vehicle = _choose_vehicle(content, wanted=options.vehicle_frame)
+        else:  # poses can only come from odometry, of the wanted frame or of any
+            vehicle = options.vehicle_frame or ""
         rig = {}
         for camera, _ in calibrated_cameras:
             topic, _ = topics[camera.name]
@@ -203,6 +204,8 @@ def _topics_of(
 ) -> dict[str, tuple[str, str]]:
     """Find the image topic of each calibrated camera; the topic of its camera info is empty.
 
+    A topic that the user has named comes before the one of the calibration file.
+
     Args:
         calibrated_cameras: Cameras of the calibration file, with their setting ``images``.
         options: Options with the topics that the user has given.
@@ -210,13 +213,27 @@ def _topics_of(
 
     Returns:
         Pairs (topic of the images, "") by the name of the camera.
+
+    Raises:
+        ValueError: If a camera has no topic, or the user has named topics that are not used.
     """
-    images = {name: topic for name, (topic, _) in options.topics.items()}
-    if not images:
-        images = image_topics(kinds)
+    names = [camera.name for camera, _ in calibrated_cameras]
+    by_hand = {}
+    for name, (topic, info) in options.topics.items():
+        if name not in names:
+            raise InputError(f"--topics names {name!r}, and the calibration has {sorted(names)}")
+        if info:
+            raise InputError(
+                f"--topics names the camera info {info} of {name!r}, which --calibration replaces: "
+                f"give {name}={topic}"
+            )
+        by_hand[name] = topic
+    images = by_hand or image_topics(kinds)
     topics = {}
     for camera, images_setting in calibrated_cameras:
-        topic = _topic_of(camera.name, images_setting, images=images, kinds=kinds)
+        topic = by_hand.get(camera.name)
+        if topic is None:
+            topic = _topic_of(camera.name, images_setting, images=images, kinds=kinds)
         topics[camera.name] = (topic, "")
     return topics
 
@@ -232,7 +249,14 @@ def _topic_of(
         images: Topics of images, by the name of the camera.
         kinds: Type of the messages, by topic.
     """
-    topic = images_setting if images_setting in kinds else images.get(name)
+    if kinds.get(images_setting) in IMAGES:
+        return images_setting
+    if images_setting.startswith("/"):  # a topic: the paths of files are relative
+        raise InputError(
+            f"camera {name!r} of the calibration: `images` is {images_setting}, which is "
+            f"{kinds.get(images_setting, 'not there')}, and must be {' or '.join(IMAGES)}"
+        )
+    topic = images.get(name)
     if topic is None:
         raise InputError(
             f"camera {name!r} of the calibration has no images: the bag's are {sorted(images)}; "

@@ -45,20 +45,11 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
     options = options or InputOptions()
     if not path.exists():
         raise FileNotFoundError(f"There is no input {path}.")
-    # A folder that contains files of bags (`parts_in`) need not be a bag. Another input in it takes
-    # precedence, see the order in `_open_folder`.
-    may_be_bag = is_bag(path) or (path.is_dir() and bool(parts_in(path)))
-    if not may_be_bag and (options.topics or options.calibration):
-        raise InputError(f"--topics and --calibration belong to a bag, and {path} is none.")
-    if not may_be_bag and options.vehicle_ground_z_m is not None:
-        raise InputError(
-            f"--vehicle-ground-z belongs to a bag, and {path} is none: the height of the road is "
-            "ground_z_m of a calibration file, or of an annotation file's AnnotationMeta."
-        )
     if is_bag(path):
         return read_bag(path, options)
     if path.is_dir():
         return _open_folder(path, options)
+    _refuse_bag_options(path, options)
     if path.suffix == ".arrow":
         return open_annotations(path, options.data_root)
     if path.suffix == ".pkl":
@@ -75,6 +66,19 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
     raise InputError(f"{path} is no input: it must be {KINDS}.")
 
 
+def _refuse_bag_options(path: Path, options: InputOptions) -> None:
+    """Raise a ``ValueError`` if an input that is no bag has options for bags."""
+    if options.topics or options.calibration or options.vehicle_frame:
+        raise InputError(
+            f"--topics, --calibration and --vehicle-frame belong to a bag, and {path} is none."
+        )
+    if options.vehicle_ground_z_m is not None:
+        raise InputError(
+            f"--vehicle-ground-z belongs to a bag, and {path} is none: the height of the road is "
+            "ground_z_m of a calibration file, or of an annotation file's AnnotationMeta."
+        )
+
+
 def _open_folder(folder: Path, options: InputOptions) -> Source:
     """Read the samples of a folder, with the reader for its content.
 
@@ -82,10 +86,12 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
     calibration file may lie beside its bags.
     """
     if versions_in(folder):  # tables of nuScenes
+        _refuse_bag_options(folder, options)
         samples, notes = read_nuscenes(folder, options.version)
         return Source(samples, frame="lidar", data_root=folder, notes=notes)
     logs = logs_in(folder)  # logs of Argoverse 2
     if logs:
+        _refuse_bag_options(folder, options)
         # The paths of the samples are relative to the root and begin with the name of a log. So the
         # root is above the log if the folder is a log itself.
         root = folder.parent if logs == [folder] else folder

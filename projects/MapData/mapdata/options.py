@@ -19,11 +19,13 @@ class InputOptions:
             of distorted cameras. Each input gets a folder in it.
         vehicle_frame: Name of the vehicle's frame (x ahead, y left, z up) in a bag's transforms;
             None takes ``base_footprint`` or ``base_link``.
-        vehicle_ground_z_m: Height of the road in the vehicle's frame in metres; None is 0.
+        vehicle_ground_z_m: Height of the road in the vehicle's frame in metres; None takes
+            ``ground_z_m`` of ``calibration``, or else 0.
         topics: Topic of the images and topic of the camera info (empty if not given) of a bag, by
             the name of the camera. ``parse_topics`` reads them from the command line.
         calibration: Calibration file of a bag's cameras, in place of their camera info and
-            transforms. The topic of a camera is its entry ``images`` in the file, or its name.
+            transforms. The topic of a camera is the one in ``topics``, its entry ``images`` in the
+            file, or its name.
         trained: Width, height, fx, fy, cx and cy of the cameras that a model was trained on, by
             name (``load_model(...).rig``). An image of a distorted camera with one of these names
             is rectified to the size and the intrinsics under this name.

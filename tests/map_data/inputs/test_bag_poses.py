@@ -1,5 +1,7 @@
 """Poses of a bag: which transforms and odometry count, and how many samples have one."""
 
+import json
+
 import numpy as np
 import pytest
 from bag_cases import START_NS, STEP_NS, Recorder, Straight, at, jpeg, options
@@ -115,6 +117,22 @@ def test_of_two_odometries_the_one_with_more_poses_is_used(straight, tmp_path):
     (note,) = source.notes
     assert "of several odometries /odom (11 poses" in note
     assert "and /gps (3 poses of 'base_link' in 'utm') is not" in note
+
+
+def test_without_transforms_the_odometry_of_the_named_frame_is_used(straight, tmp_path):
+    def poses(i, time_ns):
+        straight.recorder.odometry("/gps", time_ns, "utm", "antenna", at(1000.0, 300.0))
+        if i % 5 == 0:
+            straight.recorder.odometry("/odom", time_ns, "odom", "car", at(0.5 * i))
+
+    path = straight.write(poses=poses, mount=lambda camera: None)
+    camera = {"intrinsics": [300, 300, 160, 90], "size_px": [320, 180], "position_m": [1, 0, 1]}
+    file = tmp_path / "calibration.json"
+    file.write_text(json.dumps({"cameras": {"front": camera | {"yaw_pitch_roll_deg": [0, 0, 0]}}}))
+    _, places = read(path, tmp_path, calibration=file, vehicle_frame="car")
+    np.testing.assert_allclose(places[:, 0], drive_x(), atol=1e-5)
+    _, places = read(path, tmp_path, calibration=file)
+    np.testing.assert_allclose(places[:, 0], 1000.0)
 
 
 def test_a_seldom_transform_holds_until_the_next_one(straight, tmp_path):

@@ -228,7 +228,10 @@ def test_a_calibration_file_stands_for_infos_and_transforms(drive, minicity_root
     cameras["rear"] = cameras.pop("CAM_BACK") | {"images": "/CAM_BACK/image_raw/compressed"}
     file = tmp_path / "calibration.json"
     file.write_text(json.dumps({"cameras": cameras, "ground_z_m": 0.0}))
-    source = open_input(recorder.path, options(tmp_path, calibration=file))
+    with pytest.raises(ValueError, match=r"it has ground_z_m, and --vehicle-ground-z is given"):
+        open_input(recorder.path, options(tmp_path, calibration=file))
+    alone = options(tmp_path, calibration=file, vehicle_ground_z_m=None)
+    source = open_input(recorder.path, alone)
     assert not source.has_poses
     (sample,) = source.samples
     assert {camera.name for camera in sample.cameras} == set(cameras)
@@ -245,6 +248,40 @@ def test_a_calibration_file_stands_for_infos_and_transforms(drive, minicity_root
     file.write_text(json.dumps({"cameras": cameras}))
     with pytest.raises(ValueError, match=r"'other'.*a camera of a bag needs size_px"):
         open_input(recorder.path, options(tmp_path, calibration=file))
+
+
+def test_topics_beside_a_calibration_file_are_used_or_refused(tmp_path):
+    recorder = Recorder(tmp_path / "drive", "mcap")
+    greys = {"one": 40, "two": 220}
+
+    def paint(camera, time_ns):
+        picture = np.full((180, 320, 3), greys[camera.name], np.uint8)
+        recorder.image(camera, time_ns, cv2.imencode(".jpg", picture)[1].tobytes())
+
+    path = Straight(recorder, names=tuple(greys), count=2).write(image=paint)
+    topics = {name: f"/{name}/image_raw/compressed" for name in greys}
+    camera = {"intrinsics": [300, 300, 160, 90], "size_px": [320, 180], "position_m": [1, 0, 1]}
+    camera |= {"yaw_pitch_roll_deg": [0, 0, 0], "images": topics["one"]}
+    file = tmp_path / "calibration.json"
+    file.write_text(json.dumps({"cameras": {"one": camera}}))
+
+    def read(topics):
+        return open_input(path, options(tmp_path, calibration=file, topics=topics))
+
+    for given, grey in (({}, 40), ({"one": (topics["two"], "")}, 220)):
+        source = read(given)
+        (seen,) = source.samples[0].cameras
+        np.testing.assert_allclose(cv2.imread(str(source.data_root / seen.path)), grey, atol=2)
+    for given, message in (
+        ({"two": (topics["two"], "")}, r"--topics names 'two', and the calibration has \['one'\]"),
+        ({"one": (topics["one"], "/one/camera_info")}, r"give one=/one/image_raw/compressed"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read(given)
+    for topic, message in (("/nowhere", "not there"), ("/one/camera_info", ".*CameraInfo")):
+        file.write_text(json.dumps({"cameras": {"one": camera | {"images": topic}}}))
+        with pytest.raises(ValueError, match=f"'one' .*is {topic}, which is {message}, and must"):
+            read({})
 
 
 def foxglove_file(path, drive, root):

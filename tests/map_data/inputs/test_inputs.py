@@ -356,10 +356,25 @@ def test_what_a_calibration_names_twice_is_refused(tmp_path, name, text):
         open_input(tmp_path / name)
 
 
-def test_the_height_for_a_bag_beside_another_input_is_refused(tmp_path, minicity_annotations):
-    options = InputOptions(vehicle_ground_z_m=0.0)
-    with pytest.raises(ValueError, match="--vehicle-ground-z belongs to a bag"):
-        open_input(minicity_annotations["val"], options)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"vehicle_ground_z_m": 0.0}, "--vehicle-ground-z belongs to a bag"),
+        ({"vehicle_frame": "car"}, "--vehicle-frame belong to a bag"),
+        ({"topics": {"front": ("/front", "")}}, "--topics, .* belong to a bag"),
+        ({"calibration": Path("calibration.yaml")}, "--calibration .* belong to a bag"),
+    ],
+)
+def test_an_option_for_a_bag_is_refused_for_another_input(
+    tmp_path, minicity_root, minicity_annotations, options, message
+):
+    """Also if files of bags lie beside the input, which comes first."""
+    for name in ("maps", "v1.0-trainval"):
+        (tmp_path / name).symlink_to(minicity_root / name)
+    (tmp_path / "drive_0.mcap").touch()
+    for path in (minicity_annotations["val"], tmp_path):
+        with pytest.raises(ValueError, match=message):
+            open_input(path, InputOptions(**options))
 
 
 def test_a_distorted_camera_is_rectified_to_the_focal_length_of_the_training(tmp_path):

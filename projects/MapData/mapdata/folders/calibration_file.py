@@ -34,28 +34,36 @@ _MOST_BYTES = 300_000  # size limit of a file; parsing YAML takes some milliseco
 _MOST_VALUES = 100_000  # largest number of values in a file
 
 
-def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]], np.ndarray]:
+def read_rig(
+    file: Path, ground_z_m: float | None
+) -> tuple[list[tuple[RigCamera, str]], np.ndarray]:
     """Read the cameras of a calibration file for images that lie elsewhere, such as in a bag.
 
     Args:
         file: Calibration file, in which each camera has ``size_px``.
-        ground: Pose of the road in the vehicle's frame, in metres, for a file without
-            ``ground_z_m``. (4, 4)
+        ground_z_m: Height of the road in the vehicle's frame in metres, for a file without
+            ``ground_z_m``; None is 0.
 
     Returns:
         The cameras, each with the value of its key ``images`` (the topic in a bag, empty without
-        the key), and the pose of the road. (4, 4)
+        the key), and the pose of the road in the vehicle's frame. (4, 4)
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If the file is malformed; the message names the camera.
+        ValueError: If the file is malformed, or both it and the argument have the height of the
+            road; the message names the camera.
     """
     rig = []
     # Adds the name of the file and the remedy to the message of an error, as a ValueError.
     with explain_errors(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
-        if "ground_z_m" in content:
-            ground = ground_pose(content)
+        if ground_z_m is not None:
+            if "ground_z_m" in content:
+                raise InputError(
+                    "it has ground_z_m, and --vehicle-ground-z is given, too: leave out one"
+                )
+            content["ground_z_m"] = ground_z_m
+        ground = ground_pose(content)
         for name, camera in cameras_of(content):
             with explain_errors(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
                 check_camera_keys(camera)
