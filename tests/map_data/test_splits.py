@@ -213,9 +213,10 @@ def test_overlap_is_reported_for_each_sample_and_drawn(tmp_path: Path):
 
 
 def test_a_file_without_common_maps_is_refused(tmp_path: Path):
-    path = write_scenes(tmp_path / "infos.arrow", {"log": ("log", [(0, 0)])})
-    with pytest.raises(ValueError, match="does not say where its samples are"):
-        overlap.read_places([path])
+    for places in ({"log": ("log", [(0, 0)])}, {"a": ("t", [(0, 0)]), "b": ("", [(0, 0)])}):
+        path = write_scenes(tmp_path / "infos.arrow", places)
+        with pytest.raises(ValueError, match="does not say where its samples are"):
+            overlap.read_places([path])
 
 
 def row_of_scenes(count: int, spacing_m: float) -> dict:
@@ -240,6 +241,24 @@ def test_our_splitter_keeps_the_distance_and_gives_each_map_its_share(tmp_path: 
     # a run of neighbours costs two others at most
     assert len(parts["train"]) >= 2 * (10 - 3 - 2)
     assert parts == splitter.split_scenes(places, 25.0, 0.3, seed)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_scene_on_two_maps_is_in_one_part_and_far_from_the_other_on_both(seed: int):
+    """Of each town, the first two scenes leave for the other one, where they are near a scene."""
+    rows = []  # scene, town, x
+    for town, other in (("a", "b"), ("b", "a")):
+        for i in range(10):
+            rows.append((f"{town}{i}", town, 100.0 * i))
+        for i in range(2):
+            rows.append((f"{town}{i}", other, 100.0 * (5 + i) + 10))
+    scenes, towns, x = map(np.array, zip(*rows, strict=True))
+    places = overlap.Places(scenes, scenes, towns, np.stack([x, 0 * x], axis=1))
+    parts = splitter.split_scenes(places, min_distance_m=20.0, val_share=0.3, seed=seed)
+    assert not set(parts["train"]) & set(parts["val"])
+    train, val = (places.select(np.isin(scenes, parts[part])) for part in ("train", "val"))
+    distance, _ = overlap.sample_overlap(train, val)
+    assert distance.min() > 20.0
 
 
 def test_seeds_differ_and_impossible_splits_are_refused(tmp_path: Path):

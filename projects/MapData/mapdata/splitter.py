@@ -35,9 +35,7 @@ def _near_scenes(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -
     return near | near.T  # symmetric despite rounding errors of distances
 
 
-def _select_scenes(
-    near: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _select_scenes(near: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """Select scenes of a map for validation, one after another.
 
     A selected scene and the scenes near it are lost for training. The first scene is random. Each
@@ -49,8 +47,7 @@ def _select_scenes(
         rng: Source of the random order.
 
     Returns:
-        Mask of the selected scenes (S,), and mask of scenes that are neither selected nor near a
-        selected scene (S,).
+        Mask of the selected scenes. (S,)
     """
     rank = rng.permutation(len(near))  # random rank of each scene, which decides between equals
     selected = np.zeros(len(near), dtype=bool)
@@ -60,7 +57,7 @@ def _select_scenes(
         selected[scene] = True
         covered |= near[scene]
         if selected.sum() >= count:
-            return selected, ~covered
+            return selected
         # Column j of `near` is scene j; scenes that are already covered are lost anyway.
         num_lost = (near & ~covered).sum(1)  # scenes that training would lose with each scene
         others = np.flatnonzero(~selected)
@@ -95,26 +92,28 @@ def split_scenes(
             f"{val_share}, {min_distance_m} and {seed}."
         )
     rng = np.random.default_rng(seed)
-    parts: dict[str, list[str]] = {"train": [], "val": []}
+    names, scenes = np.unique(places.scenes, return_inverse=True)  # index of each sample's scene
+    # A scene may be on several maps. It is near the scenes that it is near on any of them.
+    is_near = np.zeros((len(names), len(names)), dtype=bool)
+    is_val = np.zeros(len(names), dtype=bool)
     for rows in places.by_map().values():
-        # `names` are the scenes on this map, and `scenes` is the index of each sample's scene.
-        names, scenes = np.unique(places.scenes[rows], return_inverse=True)
-        count = round(val_share * len(names))
-        if not count:  # a map with few scenes is used for training only
-            parts["train"] += names.tolist()
-            continue
-        near = _near_scenes(scenes, places.positions[rows], distance_m=min_distance_m)
-        selected, is_far = _select_scenes(near, count=count, rng=rng)
-        parts["train"] += names[is_far].tolist()
-        parts["val"] += names[selected].tolist()
+        # `indices` are the scenes on this map, and `map_scenes` has the place of each sample's
+        # scene among them.
+        indices, map_scenes = np.unique(scenes[rows], return_inverse=True)
+        near = _near_scenes(map_scenes, places.positions[rows], distance_m=min_distance_m)
+        is_near[np.ix_(indices, indices)] |= near
+        count = round(val_share * len(indices))
+        if count:  # a map with few scenes is used for training only
+            is_val[indices[_select_scenes(near, count=count, rng=rng)]] = True
+    is_train = ~is_near[is_val].any(axis=0)  # validation scenes are near themselves
+    parts = {"train": names[is_train].tolist(), "val": names[is_val].tolist()}
     if not parts["train"] or not parts["val"]:
         raise InputError(
-            f"{len(np.unique(places.scenes))} scenes leave {len(parts['train'])} for training and "
+            f"{len(names)} scenes leave {len(parts['train'])} for training and "
             f"{len(parts['val'])} for validation: give a smaller --min-distance, or another "
             "--val-share."
         )
-    # A set, because a scene with samples on several maps was added once for each map.
-    return {part: sorted(set(names)) for part, names in parts.items()}
+    return parts
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
