@@ -1,5 +1,6 @@
 """Info pickles in the formats of MapTR's repository, synthesised from known samples."""
 
+import json
 import os
 import pickle
 from dataclasses import replace
@@ -124,6 +125,26 @@ def test_infos_with_maps_bring_their_truth(known, tmp_path):
         convert(tmp_path, name, {"infos": infos}, tmp_path), known, strict=True
     ):
         assert_same_elements(found, wanted)
+
+
+def test_elements_that_cannot_be_used_are_counted(known, damaged_root, tmp_path):
+    """A line of one node in the map, and lines of one point in a file with ground truth."""
+    sample = known[0]
+    file = damaged_root / f"maps/expansion/{sample.map_name}.json"
+    content = json.loads(file.read_text())
+    token = content["lane_divider"][0]["line_token"]
+    (line,) = [line for line in content["line"] if line["token"] == token]
+    del line["node_tokens"][1:]
+    file.write_text(json.dumps(content))
+    lines = annotation(sample, known.meta.classes)
+    for more, reason in (
+        ({}, "lane_divider without two nodes left out"),
+        ({"annotation": lines}, "line of fewer than two points left out"),
+    ):
+        infos = tmp_path / "infos_train.pkl"
+        infos.write_bytes(pickle.dumps({"infos": [{**nuscenes_info(sample), **more}]}, protocol=4))
+        summary = convert_infos(infos, tmp_path / "out.arrow", damaged_root, "train")
+        assert summary.problems[reason] == 1
 
 
 def test_argoverse_infos_keep_three_coordinates(tmp_path):

@@ -306,6 +306,8 @@ def _samples(
         if not name or not expansion(root, name).is_file():
             return None
         layers = open_layers(root, name, classes=meta.classes)
+        for reason, count in layers.skipped.items():
+            summary.add_problem(f"{reason} left out", name, count=count)
         return NuScenesLocalMap(layers, meta.classes, x_range=meta.x_range, y_range=meta.y_range)
 
     image_sizes = _ImageSizes(summary)
@@ -321,6 +323,12 @@ def _samples(
         # Ground truth from a map is clipped to the range, so only ground truth of the file is
         # checked.
         if sample.instances is not None:
+            given = sum(len(info["annotation"][name]) for name in meta.classes)
+            if given > len(sample.instances):
+                count = given - len(sample.instances)
+                summary.add_problem(
+                    "line of fewer than two points left out", sample.token, count=count
+                )
             _check_range(sample, meta)
         elif meta.frame == "lidar":
             local_map = open_map(sample.map_name)
