@@ -103,13 +103,36 @@ def test_a_rate_and_names_select_samples(tmp_path):
 
 def test_a_log_without_a_map_has_no_ground_truth(tmp_path):
     folder = cases.write_log(tmp_path)
-    metadata = {**cases.log_metadata(), "map_metadata": None}
-    sync = pa.ipc.open_file(str(folder / "sync.arrow")).read_all()
-    cases.write_table(
-        folder / "sync.arrow", dict(zip(sync.column_names, sync, strict=True)), metadata
-    )
+    replace_metadata(folder / "sync.arrow", {**cases.log_metadata(), "map_metadata": None})
     _, file = convert(tmp_path)
     assert file[0].instances is None
+
+
+def replace_metadata(path: Path, metadata: dict) -> None:
+    """Replace the metadata of a table."""
+    table = pa.ipc.open_file(str(path)).read_all()
+    cases.write_table(path, dict(zip(table.column_names, table, strict=True)), metadata)
+
+
+@pytest.mark.parametrize("key", ["location", "dataset"])
+def test_a_map_without_a_place_is_found_by_the_log_s_or_named(key, tmp_path):
+    folder = cases.write_log(tmp_path)
+    (tmp_path / "maps/test").mkdir(parents=True)
+    (folder / "map.arrow").rename(tmp_path / "maps/test/test_town.arrow")
+    metadata = cases.log_metadata()
+    metadata["map_metadata"] |= {"map_is_per_log": False}
+    del metadata["map_metadata"][key]
+    replace_metadata(folder / "sync.arrow", metadata)
+    check_first_sample(tmp_path, convert(tmp_path)[1])
+    for value in ({key: None}, {key: ""}):
+        metadata["map_metadata"] |= value
+        replace_metadata(folder / "sync.arrow", metadata)
+        check_first_sample(tmp_path, convert(tmp_path)[1])
+    del metadata[key]
+    replace_metadata(folder / "sync.arrow", metadata)
+    message = rf"log left out: its map cannot be found, since .*sync\.arrow has no {key}: convert"
+    with pytest.raises(WorkError, match=message):
+        convert(tmp_path)
 
 
 def replace_column(path: Path, name: str, values: pa.Array) -> None:
@@ -144,6 +167,12 @@ def test_what_cannot_be_used_is_left_out_by_name(tmp_path):
     [
         ("camera.pcam_f0", "data", pa.array(["../a.jpg"] * 5), "the path must lie below"),
         ("sync", "camera.pcam_f0", pa.array([9, -1, 9, 9, 9]), "has 5 images, so no row 9"),
+        (
+            "sync",
+            "sync.timestamp_us",
+            pa.array([None] * 5, pa.int64()),
+            "sync.arrow cannot be used",
+        ),
         (
             "ego_state_se3",
             "imu_se3",

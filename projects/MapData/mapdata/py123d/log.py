@@ -214,16 +214,22 @@ class Log:
             root: Folder of py123d's data, with ``logs`` and ``maps``.
 
         Raises:
-            KeyError: If the metadata of the map lack the data set or the location.
-            ValueError: If the path leads out of the folder of maps.
+            ValueError: If neither the map nor the log has a data set or a location, or if the path
+                leads out of the folder of maps.
         """
         metadata = self.metadata.get("map_metadata")
         if not isinstance(metadata, dict):
             return None
         if metadata.get("map_is_per_log"):
             return self.folder / _MAP
-        dataset = str(metadata["dataset"])
-        file = f"{dataset}/{dataset}_{metadata['location']}.arrow"
+        dataset = metadata.get("dataset") or self.metadata.get("dataset")
+        location = metadata.get("location") or self.location
+        if not dataset or not location:
+            raise InputError(
+                f"its map cannot be found, since {self.folder / SYNC} has no "
+                f"{'location' if dataset else 'dataset'}: {REMEDY}"
+            )
+        file = f"{dataset}/{dataset}_{location}.arrow"
         return path_below(root / "maps", name=file, noun="the map's file")
 
     @cached_property
@@ -291,12 +297,12 @@ class Log:
         The row is None for a camera without an image in the frame.
         """
         with explain_errors(self.folder / SYNC, REMEDY):
-            times = self._sync["sync.timestamp_us"].to_pylist()
+            times_ns = [1000 * int(time) for time in self._sync["sync.timestamp_us"].to_pylist()]
             rows = {}
             for camera in self.cameras:
                 rows[camera.name] = self._sync[camera.key].to_pylist()
-        for frame_index, time in enumerate(times):
+        for frame_index, time_ns in enumerate(times_ns):
             row_of_camera = {}
             for name, column in rows.items():
                 row_of_camera[name] = column[frame_index]
-            yield 1000 * int(time), row_of_camera
+            yield time_ns, row_of_camera
