@@ -68,12 +68,13 @@ def test_it_has_no_state_of_its_own():
     assert not MODELS.build({"type": "MapDataPreprocessor", **SETTINGS}).state_dict()
 
 
+@pytest.mark.parametrize("raw", [((48, 64), (24, 32)), ((48, 64), (48, 64))])
 @pytest.mark.parametrize(
     ("finished", "padded"), [([(16, 12), (16, 12)], (12, 16)), ([(16, 12), (8, 6)], (12, 16))]
 )
-def test_deferred_steps_run_on_images_of_different_sizes(finished, padded):
-    """Two rigs: their images are stacked, or padded, after the steps."""
-    images = [torch.full((2, 3, *size), 100, dtype=torch.uint8) for size in ((48, 64), (24, 32))]
+def test_deferred_steps_run_on_images_of_different_sizes(finished, padded, raw):
+    """Two rigs, or a random scale: the images are stacked, or padded, after the steps."""
+    images = [torch.full((2, 3, *size), 100, dtype=torch.uint8) for size in raw]
     samples = []
     for number, size in enumerate(finished):
         meta = {"token": f"token {number}", "image_steps": [Resize(size)]}

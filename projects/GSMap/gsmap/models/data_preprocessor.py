@@ -41,7 +41,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
     def collate_data(self, data: dict[str, Any]) -> dict[str, Any]:
         """Copy a batch to the device and stack its images as ``imgs`` (B, V, 3, H, W)."""
         samples = data.get("data_samples") or ()
-        if _have_one_size(data["inputs"].get("img")):
+        if _have_one_size(data["inputs"].get("img")) and _have_joint_steps(samples):
             data = self.cast_data(data)
             imgs = torch.stack(data["inputs"]["img"])  # (B, V, 3, H, W)
             imgs = self.run_deferred_steps(imgs, samples=samples)
@@ -58,12 +58,13 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
     def _finish_one_by_one(self, data: dict[str, Any]) -> dict[str, Any]:
         """Copy a batch to the device and run the deferred steps of each sample by itself.
 
-        Raw images of different sizes, as of two rigs, cannot be stacked before these steps.
+        Raw images of different sizes, as of two rigs, cannot be stacked before these steps. Steps
+        that cannot be joined may lead to images of different sizes.
         """
         data = self.cast_data(data)
         images = []  # (V, 3, H', W') each
         for raw_images, sample in zip(data["inputs"]["img"], data["data_samples"], strict=True):
-            images.append(self.run_deferred_steps(raw_images[None], samples=[sample])[0])
+            images.append(self.run_deferred_steps(raw_images[None], samples=[sample])[0].float())
         data["inputs"]["img"] = images
         return data
 
@@ -79,8 +80,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             Images after all steps. The pipelines of the published systems run these steps on the
             CPU instead, and pack such images. (B, V, 3, H', W')
         """
-        steps = [sample.metainfo.get("image_steps") or () for sample in samples]
-        return run_image_steps(images, steps)
+        return run_image_steps(images, _steps_of(samples))
 
     def normalise(self, images: Tensor) -> Tensor:
         """Convert images to float32, normalise and pad them. (..., 3, H, W) -> (..., 3, H', W')
@@ -99,6 +99,17 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             return images
         margins = (0, columns - width, 0, rows - height)  # left, right, top, bottom
         return torch.nn.functional.pad(images, pad=margins, value=self.pad_value)
+
+
+def _steps_of(samples: Sequence[Any]) -> list[Sequence[Any]]:
+    """Deferred steps of each sample, in their order."""
+    return [sample.metainfo.get("image_steps") or () for sample in samples]
+
+
+def _have_joint_steps(samples: Sequence[Any]) -> bool:
+    """Whether the samples have no deferred steps, or steps that can be joined."""
+    steps = _steps_of(samples)
+    return not any(steps) or _join_steps(steps) is not None
 
 
 def run_image_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
