@@ -26,7 +26,7 @@ from benchmarks.measure import markdown_table
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.reading import load_weights
 from gsmap.datasets.annotations.record import CLASSES
-from gsmap.engine.arguments import data_root_options, parse_options
+from gsmap.engine.arguments import parse_options
 from gsmap.engine.launch import read_config
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write, write_text
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> None:
     settings = {key: str(getattr(args, key)) for key in _FIGURE_OPTIONS}
     for name, variant in variants.items():
         record_settings(args.out / f"{name}.settings.json", {**settings, "variant": variant})
-    options = data_root_options(args.data_root)  # overrides that set the data root of each split
+    options = {"data_root": str(args.data_root)}  # the data root of each split
     feature_files = {split: args.out / f"{split}.pt" for split in ("train", "val")}
     for split, path in feature_files.items():
         if not path.exists():

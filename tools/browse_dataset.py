@@ -42,12 +42,16 @@ def main() -> str:
 
     from gsmap.apis.map_inferencer import spread_evenly
     from gsmap.checkpoints.building import building
+    from gsmap.checkpoints.settings import dataset_of, single_dataset_of
     from gsmap.engine.launch import read_config
     from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 
     cfg = read_config(args.config, args.cfg_options)
+    settings = dataset_of(cfg, args.split)
+    if args.web:
+        settings = single_dataset_of(cfg, part=args.split, purpose="--web")
     with building(cfg):  # adds the name of the config and of its part to errors
-        dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
+        dataset = DATASETS.build(settings)
     if args.web:
         options = PageOptions(data_root=Path(dataset.data_root), max_frames=args.num)
         # The page has no results ({}), only ground truth and images. A summary is returned.

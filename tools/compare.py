@@ -39,7 +39,6 @@ from comparison.results import (
 from comparison.run_curves import plot_precision_recall
 from mmengine.config import DictAction
 
-from gsmap.engine.arguments import data_root_options
 from gsmap.methods import METHODS
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.errors import InputError, WorkError
@@ -250,9 +249,7 @@ def main() -> str:
         return "\n".join(listing(read_tables(args.tables)))
     runs: list[Run] = []
     if args.configs:
-        # Overrides that set the data root of every split.
-        data_options = data_root_options(args.data_root) if args.data_root else {}
-        options = [f"{key}={value}" for key, value in data_options.items()]
+        options = [f"data_root={args.data_root}"] if args.data_root else []
         protocol = Protocol(
             seeds=args.seeds,
             budget=args.budget,

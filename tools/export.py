@@ -33,6 +33,7 @@ from gsmap.apis.export import (
 )
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.apis.onnx_inferencer import OnnxInferencer
+from gsmap.checkpoints.settings import single_dataset_of
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.engine.arguments import add_config_options
 from gsmap.utils.cli import CommandParser, output_file, run_command
@@ -107,8 +108,8 @@ def open_samples(
     Raises:
         FileNotFoundError: If the file of the config does not exist.
     """
-    options = inferencer.cfg[f"{split}_dataloader"].dataset
     if source is None:
+        options = single_dataset_of(inferencer.cfg, part=split, purpose="an export")
         source = Path(args.data_root or options.data_root, options.ann_file)
         if not source.is_file():
             raise FileNotFoundError(

@@ -104,11 +104,13 @@ def main() -> None:
     from gsmap.apis.map_priors import use_priors
     from gsmap.checkpoints.building import building
     from gsmap.checkpoints.reading import adopt_settings
+    from gsmap.checkpoints.settings import dataset_of
     from gsmap.engine.launch import load_config
     from gsmap.engine.run_log import MapRunner
 
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     cfg = load_config(args)
+    dataset_of(cfg, "test")  # raises an error if there is none
     # The model gets the settings with which the checkpoint was trained. Notes name the changes.
     notes = adopt_settings(cfg, checkpoint, args.cfg_options)
     cfg.load_from = str(checkpoint)

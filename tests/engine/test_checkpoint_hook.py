@@ -17,6 +17,7 @@ from mmengine.model import BaseModel
 from mmengine.runner import BaseLoop
 from mmengine.runner.checkpoint import save_checkpoint
 from processes import run_python
+from torch.utils.data import ConcatDataset
 
 import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.reading import read_checked
@@ -410,3 +411,27 @@ def test_a_checkpoint_holds_the_models_settings_and_no_text_that_runs(tmp_path):
     torch.save(poisoned, tmp_path / "epoch_1.pth")
     learn(tmp_path, 2, tmp_path / "epoch_1.pth")
     assert not (tmp_path / "proof").exists()
+
+
+class Sized(list):
+    """Samples of a data set whose scaled images have a size."""
+
+    def __init__(self, width: int, *, signals: bool = True):
+        super().__init__([{"inputs": torch.ones(1)}])
+        self.scaled_image_size = lambda: (width, 9)
+        self.has_signals = lambda: signals
+
+
+def test_the_images_of_several_data_sets_are_noted_if_they_agree(tmp_path):
+    equal = ConcatDataset([Sized(16), ConcatDataset([Sized(16)])])
+    learn(tmp_path / "equal", 1, train=equal)
+    checkpoint = read_checked(tmp_path / "equal/epoch_1.pth")
+    assert checkpoint.image_size == (16, 9)
+    assert checkpoint.can_bus
+    learn(tmp_path / "mixed", 1, train=ConcatDataset([Sized(16), Sized(32, signals=False)]))
+    checkpoint = read_checked(tmp_path / "mixed/epoch_1.pth")
+    assert checkpoint.image_size is None
+    assert checkpoint.can_bus
+    log = next((tmp_path / "mixed").glob("*/*.log")).read_text()
+    assert "images of 16 x 9 and 32 x 9 pixels, so the checkpoints store no size" in log
+    assert "Some training data sets have vehicle signals and others have none" in log

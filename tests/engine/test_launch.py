@@ -61,7 +61,6 @@ def test_the_last_of_two_data_roots_and_image_scales_counts():
 @pytest.mark.parametrize(
     ("option", "instead"),
     [
-        ("data_root=other/", "give --data-root DIR, or edit CONFIG"),
         ("_cameras=[a]", "give train.dataset.cameras, val.dataset.cameras, test.dataset.cameras,"),
         ("_scale=0.5", "give train.dataset.pipeline.1.scale, val.dataset.pipeline.1.scale, "),
         ("grid.x_range=[-9,9]", "give train.dataset.grid.x_range, val.dataset.grid.x_range, "),
@@ -88,6 +87,40 @@ def test_one_scale_serves_the_images_of_every_split():
     assert scales == [0.125] * 3
     with pytest.raises(ValueError, match=r"--image-scale: no pipeline of .* has ScaleImages"):
         read_config(Config({"test_dataloader": {"dataset": {}}}), {"image_scale": 0.5})
+
+
+def test_one_folder_and_one_scale_serve_wrapped_data_sets():
+    cfg = read_config("configs/my_data.py").to_dict()
+    plain = cfg["train_dataloader"]["dataset"]
+    repeated = {"type": "RepeatDataset", "times": 2, "dataset": plain}
+    cfg["train_dataloader"]["dataset"] = {"type": "ConcatDataset", "datasets": [repeated, plain]}
+    cfg["images_on_device"] = True
+    wrapper = read_config(Config(cfg), {"data_root": "here", "image_scale": 0.25})
+    first, second = wrapper.train_dataloader.dataset.datasets
+    for dataset in (first.dataset, second):
+        assert dataset.data_root == "here"
+        assert dataset.pipeline[0].on_device
+        assert dataset.pipeline[1].scale == 0.25
+    assert "data_root" not in wrapper.train_dataloader.dataset
+
+
+@pytest.mark.parametrize("absent", [["val"], ["test"], ["val", "test"], ["train", "val"]])
+@pytest.mark.parametrize("value", ["None", "missing"])
+def test_one_folder_serves_the_splits_that_there_are(absent, value):
+    cfg = read_config("configs/my_data.py").to_dict()
+    for split in absent:
+        cfg[f"{split}_dataloader"] = None
+        if value == "missing":
+            del cfg[f"{split}_dataloader"]
+    read = read_config(Config(cfg), {"data_root": "here"})
+    for split in SPLITS:
+        loader = read.get(f"{split}_dataloader")
+        assert loader is None if split in absent else loader.dataset.data_root == "here"
+
+
+def test_a_folder_for_no_data_set_is_refused():
+    with pytest.raises(ValueError, match=r"--data-root: .* has no data set"):
+        read_config(Config({"val_dataloader": None}), {"data_root": "here"})
 
 
 def test_a_missing_config_is_named():

@@ -2,6 +2,7 @@
 
 import errno
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from mmengine.evaluator import Evaluator
 from mmengine.evaluator.metric import DumpResults
 from mmengine.hooks import Hook
 from mmengine.runner import Runner
+from torch.utils.data import ConcatDataset as TorchConcat
 
 import gsmap.registered  # noqa: F401
-from gsmap.engine.run_log import MapRunner, _missed_elements_warning
+from gsmap.engine.run_log import MapRunner, _describe_data, _missed_elements_warning
 
 
 @pytest.mark.parametrize("level", ["INFO", "DEBUG"])
@@ -76,6 +78,40 @@ def test_elements_that_no_query_is_left_for_are_counted():
         "24 elements can never be found."
     )
     assert _missed_elements_warning(*run_with([3, 20, -1], 20)) is None
+
+
+class Drives:
+    """A data set of samples with one camera and one map element each."""
+
+    cameras = None
+    metainfo: ClassVar = {"x_range": (-1, 1), "y_range": (-2, 2), "classes": ("divider",)}
+
+    def __init__(self, ann_file, width):
+        self.ann_file = ann_file
+        self.annotations = SimpleNamespace(instance_counts=lambda: np.array([1, width]))
+        self._camera = SimpleNamespace(name="front", width=width, height=9)
+
+    def __len__(self):
+        return 2
+
+    def sample(self, index):
+        return SimpleNamespace(cameras=[self._camera])
+
+
+def test_data_sets_inside_of_others_are_described():
+    repeated = SimpleNamespace(dataset=Drives("b.arrow", 32))
+    train = TorchConcat([Drives("a.arrow", 16), TorchConcat([Drives("a.arrow", 16)])])
+    train.datasets.append(repeated)
+    runner, model = run_with([], 20)
+    runner.train_dataloader.dataset = train
+    runner.val_loop = True
+    runner.val_dataloader = SimpleNamespace(dataset=Drives("c.arrow", 64))
+    lines = _describe_data(runner)
+    assert lines["training"] == "4 samples of a.arrow, b.arrow"
+    assert lines["validation"] == "2 samples of c.arrow"
+    assert lines["cameras"] == "1, their files 16 x 9 and 32 x 9 and 64 x 9"
+    assert lines["elements"] == "up to 32 in a sample"
+    assert "12 elements can never be found" in _missed_elements_warning(runner, model)
 
 
 @pytest.mark.parametrize("loop", ["train", "test"])

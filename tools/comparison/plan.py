@@ -23,7 +23,7 @@ from mmengine.config import Config
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.checkpoints.reading import read_weights
-from gsmap.checkpoints.settings import differences, plain
+from gsmap.checkpoints.settings import differences, plain, single_dataset_of
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, read_config
@@ -317,8 +317,9 @@ def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int)
     Raises:
         ValueError: If the budget is not a whole number of epochs.
     """
+    dataset = single_dataset_of(cfg, part="train", purpose="a comparison")
     with building(cfg):  # adds the name of the config to errors
-        num_samples = len(DATASETS.build(cfg.train_dataloader.dataset))
+        num_samples = len(DATASETS.build(dataset))
     samples_per_process = math.ceil(num_samples / processes)
     steps_per_epoch = math.ceil(samples_per_process / cfg.train_dataloader.batch_size)
     epochs = round(protocol.budget / steps_per_epoch) or 1  # at least 1
@@ -335,7 +336,7 @@ def _data_settings(cfg: Config) -> dict[str, Any]:
     settings: dict[str, Any] = {}
     # Paths are left out, but the digests of the annotation files are included.
     for part in ("train", "test"):
-        dataset = cfg[f"{part}_dataloader"].dataset
+        dataset = single_dataset_of(cfg, part=part, purpose="a comparison")
         path = Path(dataset.get("data_root", ""), dataset.ann_file)
         keys = ("split", "classes", "grid", "frame", "cameras", "indices")
         settings[part] = {key: plain(dataset.get(key)) for key in keys}

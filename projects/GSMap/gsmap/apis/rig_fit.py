@@ -349,7 +349,8 @@ class RigFitHook(Hook):
         # In a test, no training loop is built: the attribute is still a config, or None.
         if runner._resume or isinstance(runner._train_loop, dict | None):
             return
-        dataset = innermost(runner.train_dataloader.dataset)  # without wrappers
+        # The first of several data sets; mmengine requires that their metainfo are equal.
+        dataset = innermost(runner.train_dataloader.dataset)[0]
         state = checkpoint.get("state_dict", checkpoint)
         # A model for several GPUs is wrapped. Its wrapper adds the prefix "module." to all keys.
         weights = {key.removeprefix("module."): value for key, value in state.items()}

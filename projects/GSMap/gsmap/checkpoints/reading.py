@@ -28,6 +28,7 @@ from gsmap.checkpoints.settings import (
     TRAINING_SETTINGS,
     check_settings,
     differences,
+    innermost_datasets,
     plain,
     scale_steps,
 )
@@ -346,7 +347,8 @@ def _adopt_test_data(cfg: Config, checkpoint: Checkpoint, overrides: dict[str, A
         for step in scale_steps(cfg, "test"):
             step.trained_size = checkpoint.image_size
     if checkpoint.can_bus:
-        cfg.test_dataloader.dataset.setdefault("signals_from_poses", True)
+        for dataset in innermost_datasets(cfg.test_dataloader.dataset):
+            dataset.setdefault("signals_from_poses", True)
 
 
 def _is_training_setting(name: str) -> bool:

@@ -76,11 +76,72 @@ def pipeline_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
     steps: list[ConfigDict] = []
     for part in parts:
         loader = cfg.get(f"{part}_dataloader") or {}
-        pipeline = loader.get("dataset", {}).get("pipeline") or []
-        for step in pipeline:
-            if isinstance(step, ConfigDict):  # mmengine also allows functions, without settings
-                steps.append(step)
+        for dataset in nested_datasets(loader.get("dataset") or {}):
+            for step in dataset.get("pipeline") or []:
+                # mmengine also allows functions, which have no settings.
+                if isinstance(step, ConfigDict):
+                    steps.append(step)
     return steps
+
+
+def wrapped_datasets(dataset: Mapping[str, Any]) -> list[Any]:
+    """Configs of the data sets directly inside of a wrapper such as ``ConcatDataset``.
+
+    Args:
+        dataset: Config of a data set. The result is empty if it is no wrapper.
+    """
+    if dataset.get("dataset") is not None:
+        return [dataset["dataset"]]
+    return list(dataset.get("datasets") or [])
+
+
+def nested_datasets(dataset: Any) -> list[Any]:
+    """Config of a data set, followed by the configs of all data sets inside of it."""
+    nested = [dataset]
+    for inner_dataset in wrapped_datasets(dataset):
+        nested += nested_datasets(inner_dataset)
+    return nested
+
+
+def innermost_datasets(dataset: Any) -> list[Any]:
+    """Configs of the data sets inside of all wrappers, or the config itself without a wrapper."""
+    return [inner for inner in nested_datasets(dataset) if not wrapped_datasets(inner)]
+
+
+def dataset_of(cfg: Config, part: str) -> ConfigDict:
+    """Config of the data set of a split.
+
+    Args:
+        cfg: The config.
+        part: Split, ``"train"``, ``"val"`` or ``"test"``.
+
+    Raises:
+        ValueError: If the config has no data for this split.
+    """
+    dataset = (cfg.get(f"{part}_dataloader") or {}).get("dataset")
+    if not dataset:
+        raise InputError(f"{cfg.filename} has no {part}_dataloader.dataset, which is needed here.")
+    return dataset
+
+
+def single_dataset_of(cfg: Config, part: str, purpose: str) -> ConfigDict:
+    """Config of the data set of a split, which must be no wrapper of other data sets.
+
+    Args:
+        cfg: The config.
+        part: Split, ``"train"``, ``"val"`` or ``"test"``.
+        purpose: Option or command that needs a single data set, for the error.
+
+    Raises:
+        ValueError: If the config has no data for this split, or the data set is a wrapper.
+    """
+    dataset = dataset_of(cfg, part)
+    if wrapped_datasets(dataset):
+        raise InputError(
+            f"{purpose}: {part}_dataloader.dataset of {cfg.filename} is a {dataset.type} of other "
+            "data sets: name one of these instead."
+        )
+    return dataset
 
 
 def check_settings(settings: Any, config: dict[str, Any]) -> dict[str, Any]:

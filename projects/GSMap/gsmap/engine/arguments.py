@@ -11,12 +11,6 @@ from typing import Any
 from mmengine.config import DictAction
 
 
-def data_root_options(data_root: str | Path) -> dict[str, str]:
-    """Return config overrides, by dotted name, that set the data root of every split."""
-    splits = ("train", "val", "test")
-    return {f"{split}_dataloader.dataset.data_root": str(data_root) for split in splits}
-
-
 class _OptionAction(argparse.Action):
     """Store ``--data-root`` or ``--image-scale`` and add it to the config overrides.
 
@@ -30,18 +24,12 @@ class _OptionAction(argparse.Action):
     ) -> None:
         earlier_overrides = dict(getattr(namespace, "cfg_options", None) or {})
         earlier_value = getattr(namespace, self.dest, None)
-        if earlier_value is not None:  # the option is given twice, and the last value counts
-            for key, value in self._overrides(earlier_value).items():
-                if earlier_overrides.get(key) == value:
-                    del earlier_overrides[key]
+        # If the option is given twice, the last value counts.
+        if earlier_value is not None and earlier_overrides.get(self.dest) == earlier_value:
+            del earlier_overrides[self.dest]
         setattr(namespace, self.dest, values)
-        namespace.cfg_options = {**self._overrides(values), **earlier_overrides}
-
-    def _overrides(self, value: Any) -> dict[str, Any]:
-        """Return the config overrides for a value of the option."""
-        if self.dest == "data_root":
-            return data_root_options(value)
-        return {self.dest: value}  # `read_config` scales all images by ``image_scale``
+        # `read_config` applies these two overrides to all splits.
+        namespace.cfg_options = {self.dest: values, **earlier_overrides}
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:

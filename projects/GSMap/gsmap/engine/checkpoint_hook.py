@@ -76,6 +76,44 @@ def _pass_model_facts(loop: Any, path: Path, meta: dict[str, Any]) -> None:
     loop.evaluator.dataset_meta = {**(loop.evaluator.dataset_meta or {}), **facts}
 
 
+def _described_datasets(runner: Runner) -> list[Any]:
+    """Return the training data sets that know their image size and their signals."""
+    datasets = innermost(runner.train_dataloader.dataset)
+    return [dataset for dataset in datasets if hasattr(dataset, "scaled_image_size")]
+
+
+def _image_facts(runner: Runner) -> dict[str, Any]:
+    """Return the size of the scaled training images, and whether some samples have signals.
+
+    There is no size if the training data sets have several ones.
+    """
+    datasets = _described_datasets(runner)
+    sizes = {dataset.scaled_image_size() for dataset in datasets}
+    facts: dict[str, Any] = {}
+    if len(sizes) == 1:
+        facts[IMAGE_SIZE] = list(sizes.pop())
+    if datasets:
+        facts[SIGNALS] = any(dataset.has_signals() for dataset in datasets)
+    return facts
+
+
+def _warn_of_differences(runner: Runner) -> None:
+    """Log a warning if the training data sets differ in facts that the checkpoints store."""
+    datasets = _described_datasets(runner)
+    sizes = sorted({dataset.scaled_image_size() for dataset in datasets})
+    if len(sizes) > 1:
+        texts = [f"{width} x {height}" for width, height in sizes]
+        runner.logger.warning(
+            f"The training data sets have scaled images of {' and '.join(texts)} pixels, so the "
+            "checkpoints store no size, and inference scales images as its config says."
+        )
+    if len({dataset.has_signals() for dataset in datasets}) > 1:
+        runner.logger.warning(
+            "Some training data sets have vehicle signals and others have none: inference will "
+            "compute missing signals from the poses."
+        )
+
+
 @HOOKS.register_module()
 class AtomicCheckpointHook(CheckpointHook):
     """mmengine's checkpoint hook, made safe for killed runs and for untrusted checkpoints.
@@ -176,10 +214,7 @@ class AtomicCheckpointHook(CheckpointHook):
             )
         settings = plain(runner.cfg.model.to_dict())  # JSON types only
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
-        dataset = innermost(runner.train_dataloader.dataset)  # without wrappers
-        if hasattr(dataset, "scaled_image_size"):
-            checkpoint["meta"][IMAGE_SIZE] = list(dataset.scaled_image_size())
-            checkpoint["meta"][SIGNALS] = dataset.has_signals()
+        checkpoint["meta"].update(_image_facts(runner))
 
     def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
         """Save a checkpoint, and write its path to the file `NEWEST`.
@@ -224,6 +259,7 @@ class AtomicCheckpointHook(CheckpointHook):
         """
         super().before_train(runner)  # restores the paths of the best checkpoints when resuming
         self._forget_foreign_best(runner)
+        _warn_of_differences(runner)
         if isinstance(runner.val_loop, BaseLoop):
             self._check_split(_metainfo(runner.train_dataloader), loop=runner.val_loop)
         loop = runner.train_loop

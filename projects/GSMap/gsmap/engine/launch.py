@@ -23,7 +23,7 @@ from mmengine.utils import import_modules_from_strings
 
 from gsmap.checkpoints.building import reading_config
 from gsmap.checkpoints.named_models import find_config
-from gsmap.checkpoints.settings import pipeline_steps, scale_steps
+from gsmap.checkpoints.settings import innermost_datasets, pipeline_steps, scale_steps
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.engine.targets import check_targets, class_of_type, share_settings
 from gsmap.utils.errors import InputError
@@ -66,7 +66,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     Args:
         config: File or name of a config (`find_config`), or a ``Config``, which is copied.
         cfg_options: Overrides by dotted name. The name ``image_scale`` sets the scale of all
-            images.
+            images, and ``data_root`` the data root of all data sets.
 
     Returns:
         The config, complete for building a runner or a model.
@@ -85,11 +85,14 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
             cfg = Config.fromfile(path, import_custom_modules=False)
     options = dict(cfg_options or {})
     factor = options.pop("image_scale", None)
+    data_root = options.pop("data_root", None)
     for name in options:
         _check_effect(cfg, name=name)
     # Raises an error if an override has another kind of value than the setting, for example a
     # number in place of a dictionary.
     check_kinds(cfg.to_dict(), overrides=options, source=cfg.filename or "the config")
+    if data_root is not None:  # before the overrides, which may set another root for a split
+        _set_data_root(cfg, data_root=str(data_root))
     with reading_config(f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(options)
     if factor is not None:
@@ -102,6 +105,23 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
     share_settings(cfg)  # copies settings of the head to the transforms that make its targets
     return cfg
+
+
+def _set_data_root(cfg: Config, data_root: str) -> None:
+    """Set the data root of all data sets of a config, in place.
+
+    Raises:
+        ValueError: If the config has no data set.
+    """
+    datasets: list[Any] = []
+    for split in ("train", "val", "test"):
+        loader = cfg.get(f"{split}_dataloader") or {}
+        if loader.get("dataset"):
+            datasets += innermost_datasets(loader.dataset)
+    if not datasets:
+        raise InputError(f"--data-root: {cfg.filename} has no data set.")
+    for dataset in datasets:
+        dataset.data_root = data_root
 
 
 def _scale_images(cfg: Config, factor: float) -> None:
@@ -385,14 +405,11 @@ def _check_effect(cfg: Config, name: str) -> None:
         value = value.get(key) if isinstance(value, dict) else None
     # A copy of _name is expected in a setting of that name without the underscore.
     last_key = keys[-1] if keys else top.removeprefix("_")
-    if name == "data_root":  # one option sets all copies
-        copies = ["--data-root DIR"]
-    else:
-        settings = {}
-        for key, setting in cfg.items():
-            if key not in _COPIED_KEYS and not key.startswith("_"):
-                settings[key] = setting
-        copies = list(_find_copies(settings, key=last_key, value=value, prefix=""))
+    settings = {}
+    for key, setting in cfg.items():
+        if key not in _COPIED_KEYS and not key.startswith("_"):
+            settings[key] = setting
+    copies = list(_find_copies(settings, key=last_key, value=value, prefix=""))
     remedy = f"give {', '.join(copies)}, or edit" if copies else "edit"
     raise InputError(
         f"--cfg-options {name} changes nothing: the other settings have copies of it, made when "

@@ -2,6 +2,7 @@
 
 from mmengine.config import Config
 
+from gsmap.checkpoints.settings import single_dataset_of
 from gsmap.engine.launch import has_trained_memory
 from gsmap.utils.errors import InputError
 
@@ -28,12 +29,8 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
     for name, number in (("--overfit", samples), ("--overfit-iterations", iterations)):
         if number < 1:
             raise InputError(f"{name} must be >= 1, got {number}.")
+    dataset = single_dataset_of(cfg, part="train", purpose="--overfit")
     loader = cfg.train_dataloader
-    if "dataset" in loader.dataset or "datasets" in loader.dataset:
-        raise InputError(
-            f"--overfit: train_dataloader.dataset of {cfg.filename} is a {loader.dataset.type} of "
-            "other data sets: name one of these instead."
-        )
     sampler = loader.sampler.type
     if sampler != "DefaultSampler":
         raise InputError(
@@ -47,7 +44,7 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
         )
     # This sampler repeats the samples without end, which suits a training that counts iterations.
     loader.sampler = {"type": "InfiniteSampler", "shuffle": True}
-    loader.dataset.indices = samples  # for mmengine, a number selects the first samples
+    dataset.indices = samples  # for mmengine, a number selects the first samples
     loader.batch_size = min(loader.batch_size, samples)
     loader.num_workers = 0  # a few samples are loaded in the process of the training
     loader.persistent_workers = False  # not allowed without workers

@@ -17,6 +17,7 @@ from mmengine.optim import AmpOptimWrapper
 from mmengine.runner import EpochBasedTrainLoop, Runner
 from torch import nn
 
+from gsmap.checkpoints.convert import summarize_names
 from gsmap.engine.cpu_autocast import CPUAutocastOptimWrapper
 from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
 from gsmap.engine.rank_watch import RankWatch
@@ -210,11 +211,18 @@ def _describe_model(model: nn.Module) -> str:
     )
 
 
-def innermost(dataset: Any) -> Any:
-    """Return the data set inside of wrappers such as ``RepeatDataset``."""
-    while hasattr(dataset, "dataset"):
-        dataset = dataset.dataset
-    return dataset
+def innermost(dataset: Any) -> list[Any]:
+    """Return the data sets inside of wrappers such as ``RepeatDataset`` and ``ConcatDataset``."""
+    if hasattr(dataset, "datasets"):
+        wrapped = dataset.datasets
+    elif hasattr(dataset, "dataset"):
+        wrapped = [dataset.dataset]
+    else:
+        return [dataset]
+    datasets = []
+    for inner_dataset in wrapped:
+        datasets += innermost(inner_dataset)
+    return datasets
 
 
 def _describe_data(runner: Runner) -> dict[str, str]:
@@ -223,18 +231,22 @@ def _describe_data(runner: Runner) -> dict[str, str]:
     if runner.val_loop is not None:
         loaders["validation"] = runner.val_dataloader
     lines = {}
+    datasets = []
     for name, loader in loaders.items():
-        dataset = innermost(loader.dataset)
-        file = getattr(dataset, "ann_file", type(dataset).__name__)
-        lines[name] = f"{format_count(len(loader.dataset), noun='sample')} of {file}"
-    # `dataset` is now the last one of the loop. The cameras and the map are equal in all of them.
-    if not hasattr(dataset, "sample"):
+        inner_datasets = innermost(loader.dataset)
+        files = [getattr(inner, "ann_file", type(inner).__name__) for inner in inner_datasets]
+        samples = format_count(len(loader.dataset), noun="sample")
+        lines[name] = f"{samples} of {summarize_names(list(dict.fromkeys(files)))}"
+        datasets += inner_datasets
+    if not all(hasattr(dataset, "sample") for dataset in datasets):
         return lines
-    cameras = dataset.sample(0).cameras  # records of the first sample
-    # Without a selection in the config, `dataset.cameras` is None: all cameras are used.
-    names = dataset.cameras or [camera.name for camera in cameras]
+    cameras = []  # records of the first sample of each data set
+    for dataset in datasets:
+        cameras += dataset.sample(0).cameras
+    # Without a selection in the config, `cameras` of a data set is None: all cameras are used.
+    names = datasets[0].cameras or {camera.name for camera in datasets[0].sample(0).cameras}
     sizes = sorted({f"{camera.width} x {camera.height}" for camera in cameras})
-    meta = dataset.metainfo
+    meta = datasets[0].metainfo  # the map is equal in all data sets
     x_min, x_max = meta["x_range"]
     y_min, y_max = meta["y_range"]
     lines["cameras"] = f"{len(names)}, their files {' and '.join(sizes)}"
@@ -249,13 +261,17 @@ def _describe_data(runner: Runner) -> dict[str, str]:
 
 def _element_counts(loader: Any) -> np.ndarray:
     """Return the number of map elements of each sample, 0 if unknown. (number of samples,)"""
-    return np.maximum(innermost(loader.dataset).annotations.instance_counts(), 0)
+    counts = []
+    for dataset in innermost(loader.dataset):
+        counts.append(dataset.annotations.instance_counts())
+    return np.maximum(np.concatenate(counts), 0)
 
 
 def _missed_elements_warning(runner: Runner, model: Any) -> str | None:
     """Return a warning if training samples have more elements than the model has queries."""
     groups = getattr(getattr(model, "map_head", None), "query_groups", None)
-    if not groups or not hasattr(innermost(runner.train_dataloader.dataset), "annotations"):
+    datasets = innermost(runner.train_dataloader.dataset)
+    if not groups or not all(hasattr(dataset, "annotations") for dataset in datasets):
         return None
     counts = _element_counts(runner.train_dataloader)
     queries = groups[0].num  # only the first group is used in prediction

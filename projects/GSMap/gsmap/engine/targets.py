@@ -13,6 +13,7 @@ from mmdet3d.registry import MODELS, TRANSFORMS
 from mmengine.config import Config
 from mmengine.registry import Registry
 
+from gsmap.checkpoints.settings import wrapped_datasets
 from gsmap.utils.errors import InputError
 from gsmap.utils.targets import NeedsTargets
 
@@ -207,10 +208,7 @@ def _pipelines(dataset: dict[str, Any]) -> list[list[Any]]:
     Without a data set, the result is empty.
     """
     steps = list(dataset.get("pipeline") or ())
-    if dataset.get("dataset"):
-        inner_datasets = [dataset["dataset"]]
-    else:
-        inner_datasets = dataset.get("datasets") or []
+    inner_datasets = wrapped_datasets(dataset)
     if not inner_datasets:
         return [steps] if dataset else []
     pipelines = []
