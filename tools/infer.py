@@ -379,7 +379,7 @@ def predict(
     """
     tokens = dataset.annotations.column("token")
     broken: dict[str, str] = {}
-    # Samples of an earlier run, predicted or broken. A copy, because the log adds to its set.
+    # Predicted samples of an earlier run. A copy, because the log adds to its set.
     done = set(results.done) if results else set()
     with Progress(total=len(chosen), unit="samples", smoothing=0.05) as bar:
         if results and results.dropped:
@@ -389,7 +389,6 @@ def predict(
             )
         if results and done:
             bar.write(f"going on after {len(done)} of {format_count(len(chosen), 'sample')}")
-            broken.update(results.broken)
             # A model that uses earlier frames must process all of them again. Their predictions are
             # not logged a second time.
             if not remembers(inferencer):
@@ -401,8 +400,6 @@ def predict(
             broken[frame.token] = frame.reason
             bar.write(f"broken frame skipped: {frame.reason}")
             bar.update()
-            if results and frame.token not in done:
-                results.add_broken(frame.token, frame.reason)
 
         samples = inferencer.predict(
             dataset,

@@ -40,7 +40,7 @@ LINE = '{"sample_token":"t0","vectors":[{"pts":%s,"cls_name":"%s","confidence_le
         [HEAD, '{"sample_token":1,"vectors":[]}'],
         [HEAD, '{"sample_token":["t0"],"vectors":[]}'],
         [HEAD, '{"sample_token":"t0","vectors":[1]}'],
-        [HEAD, '{"sample_token":"t0","broken":2}'],
+        [HEAD, '{"sample_token":"t0","broken":"no image"}'],
         [HEAD, '{"sample_token":"t0","vectors":[{}]}'],
         [HEAD, LINE % ("[[0,0],[NaN,1]]", "divider", "0.5")],
         [HEAD, LINE % ("[[0,0],[1,1]]", "divider", "7")],

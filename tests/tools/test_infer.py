@@ -56,8 +56,9 @@ def test_a_root_without_annotation_files_is_predicted_and_can_be_merged(
             assert a["confidence_level"] == pytest.approx(b["confidence_level"], abs=1e-5)
 
 
-def test_a_killed_run_goes_on_and_broken_frames_are_named(
-    drive, model, minicity_root, tmp_path, capsys, monkeypatch
+@pytest.mark.parametrize("repaired", [False, True])
+def test_a_killed_run_goes_on_and_broken_frames_are_named_and_tried_again(
+    repaired, drive, model, minicity_root, tmp_path, capsys, monkeypatch
 ):
     folder = tmp_path / "drive/samples"
     folder.unlink()
@@ -86,15 +87,20 @@ def test_a_killed_run_goes_on_and_broken_frames_are_named(
     monkeypatch.setattr(
         MapInferencer, "vectors", lambda s, x: calls.append("again") or original(s, x)
     )
-    with pytest.raises(SystemExit) as end:
+    if repaired:
+        broken.symlink_to(minicity_root / "samples/CAM_BACK" / broken.name)
         infer.main(words)
-    assert end.value.code == infer.SKIPPED
-    assert calls.count("again") == 1  # two were there, and the broken one, whose line was cut
+    else:
+        with pytest.raises(SystemExit) as end:
+            infer.main(words)
+        assert end.value.code == infer.SKIPPED
+    predicted = 4 if repaired else 3
+    assert calls.count("again") == predicted - 1  # the second line was cut
     printed = capsys.readouterr().out
-    assert "going on after 2 of 4 samples" in printed
-    assert "3 of 4 samples predicted" in printed
+    assert "going on after 1 of 4 samples" in printed
+    assert f"{predicted} of 4 samples predicted" in printed
     assert broken.name in printed
-    assert len(results(out)) == 3
+    assert len(results(out)) == predicted
     assert not unfinished.exists()
 
 
@@ -129,7 +135,8 @@ def test_memory_sees_the_frames_before_after_a_kill_too(
 
 def test_other_settings_start_anew(drive, model, tmp_path, capsys):
     out = tmp_path / "map.json"
-    (tmp_path / "map.json.unfinished").write_text('{"other": 1}\n{"sample_token": "x"}\n')
+    lines = ['{"other": 1}', '{"sample_token": "x", "vectors": []}']
+    (tmp_path / "map.json.unfinished").write_text("\n".join([*lines, ""]))
     infer.main([str(drive), "--model", *model, "--out", str(out), "--max-samples", "1"])
     assert "going on" not in capsys.readouterr().out
     assert len(results(out)) == 1

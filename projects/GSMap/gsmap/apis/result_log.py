@@ -18,6 +18,7 @@ class ResultLog:
     """File ``OUT.unfinished`` with one line per frame, which becomes ``OUT`` when it is complete.
 
     The log is a context manager. It reuses the frames of an interrupted run with equal settings.
+    A frame that could not be predicted has no line, so a later run tries it again.
 
     Args:
         out: The result file.
@@ -32,7 +33,6 @@ class ResultLog:
 
     Attributes:
         done: Tokens of the finished frames.
-        broken: Reason of each broken frame, which is a frame that cannot be used, by token.
         dropped: Number of frames of a run with other settings, which are not used.
     """
 
@@ -50,7 +50,6 @@ class ResultLog:
         self.path = out.with_name(out.name + _SUFFIX)
         self._head = json.dumps(settings, sort_keys=True) + "\n"  # first line of the log
         self.done: set[str] = set()
-        self.broken: dict[str, str] = {}
 
     def __enter__(self) -> "ResultLog":
         self.out.parent.mkdir(parents=True, exist_ok=True)
@@ -92,12 +91,11 @@ class ResultLog:
             frame = _parse_line(line)
             is_valid = self._is_frame(frame, same_settings=same_settings)
             self._require(is_valid, line_number=line_number)
-            self._record(frame)
+            self.done.add(frame["sample_token"])
             end += len(line)
         if not same_settings:
             self.dropped = len(self.done)
             self.done.clear()
-            self.broken.clear()
             end = 0
         with add_path_to_errors(self.path):
             self._file.truncate(end)
@@ -120,9 +118,7 @@ class ResultLog:
             return False
         if same_settings and self._tokens is not None and token not in self._tokens:
             return False
-        if not isinstance(frame.get("broken", ""), str):
-            return False
-        return self._are_elements(frame.get("vectors", []), same_settings=same_settings)
+        return self._are_elements(frame.get("vectors"), same_settings=same_settings)
 
     def _are_elements(self, vectors: Any, same_settings: bool) -> bool:
         """Whether the elements of a frame are valid and belong to classes of the run.
@@ -154,19 +150,6 @@ class ResultLog:
     def __exit__(self, *exception: object) -> None:
         self._file.close()
 
-    def _record(self, frame: dict[str, Any]) -> None:
-        """Add a frame to the finished frames."""
-        self.done.add(frame["sample_token"])
-        if "broken" in frame:
-            self.broken[frame["sample_token"]] = frame["broken"]
-
-    def _append(self, frame: dict[str, Any]) -> None:
-        """Write a frame to the file."""
-        self._record(frame)
-        with add_path_to_errors(self.path):
-            self._file.write(json.dumps(frame, separators=(",", ":")).encode() + b"\n")
-            self._file.flush()
-
     def add(self, token: str, vectors: list[dict[str, Any]]) -> None:
         """Add the predictions of a frame.
 
@@ -174,16 +157,11 @@ class ResultLog:
             token: Token of the frame.
             vectors: Elements in the format of the results JSON.
         """
-        self._append({"sample_token": token, "vectors": vectors})
-
-    def add_broken(self, token: str, reason: str) -> None:
-        """Add a frame that cannot be used.
-
-        Args:
-            token: Token of the frame.
-            reason: Message of the error.
-        """
-        self._append({"sample_token": token, "broken": reason})
+        frame = {"sample_token": token, "vectors": vectors}
+        self.done.add(token)
+        with add_path_to_errors(self.path):
+            self._file.write(json.dumps(frame, separators=(",", ":")).encode() + b"\n")
+            self._file.flush()
 
     def finish(self, meta: dict[str, Any]) -> int:
         """Write the result file in the order of tokens, and remove the unfinished one.
@@ -192,7 +170,7 @@ class ResultLog:
             meta: Metadata of the result file, in types of JSON.
 
         Returns:
-            Number of frames in the result file. Broken frames are left out.
+            Number of frames in the result file.
         """
         positions: list[tuple[str, int]] = []  # token and start of its line, in bytes
         with self.path.open("rb") as file:
@@ -200,8 +178,7 @@ class ResultLog:
             position = file.tell()
             for line in file:
                 token = json.loads(line)["sample_token"]
-                if token not in self.broken:
-                    positions.append((token, position))
+                positions.append((token, position))
                 position += len(line)
             positions.sort()
 
