@@ -1,5 +1,6 @@
 """Lanelets of centre lines and of driven lanes, as the ``lanelet2`` package routes on them."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from drive_cases import drive_of
 
 from drivemaps.directed_lines import resample
 from drivemaps.drive import Drive, DriveFrame, read_drive
-from drivemaps.driven_lanes import driven_lanes
+from drivemaps.driven_lanes import _join_repeats, driven_lanes
 from drivemaps.geodetic import MapOrigin
 from drivemaps.lanelet2 import write_lanelet2
 from drivemaps.lanelets import lane_graph, lane_graph_of
@@ -314,6 +315,21 @@ def test_a_block_driven_twice_has_one_ring_of_lanelets(lead, tmp_path) -> None:
     assert reached({0}, following) == set(following)
     length_m = sum(shapely.LineString(lane.left).length for lane in lanes.lanelets)
     assert length_m < 1.2 * ring.length + 80.0
+
+
+def test_many_stretches_are_joined_in_linear_time() -> None:
+    """Each stretch of nine points begins at the middle of the one before."""
+    count = 20_000
+    points = np.random.default_rng(0).random((10 * count, 2))
+    firsts = 10 * np.arange(count)
+    earlier_points = np.full(len(points), -1)
+    earlier_points[firsts[1:]] = firsts[:-1] + 4
+    start_s = time.process_time()
+    lines = _join_repeats(points, [(first, first + 8) for first in firsts.tolist()], earlier_points)
+    assert time.process_time() - start_s < 10.0  # a search of all stretches takes a minute
+    assert len(lines) == 2 * count - 1
+    np.testing.assert_array_equal(lines[2], points[[4, 11, 12, 13, 14]])
+    np.testing.assert_array_equal(lines[-1], points[[-16, *range(-9, -1)]])
 
 
 def test_borders_beside_a_wide_lane_are_too_far_for_its_bounds() -> None:

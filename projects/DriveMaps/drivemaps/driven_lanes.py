@@ -1,5 +1,6 @@
 """Centre lines of the lanes that a vehicle has driven, computed from dividers and boundaries."""
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -210,7 +211,7 @@ def _join_repeats(
 
     Args:
         points: Points of all lanes, in metres. (n, 2)
-        stretches: Indices of the first and the last point of each stretch.
+        stretches: Indices of the first and the last point of each stretch, in ascending order.
         earlier_points: First point driven at the place of each point; -1 if there is none. (n,)
 
     Returns:
@@ -218,13 +219,12 @@ def _join_repeats(
         each (n, 2)
     """
     joints = _joints(stretches, earlier_points)
+    joined_points = sorted(set(joints.values()))
     centerlines = []
     for first, last in stretches:
-        meetings = [first, last]  # points at which other stretches meet this one, and its ends
-        for point in set(joints.values()):
-            if first < point < last:
-                meetings.append(point)
-        meetings.sort()
+        # Points at which other stretches meet this one.
+        inner_points = slice(bisect_right(joined_points, first), bisect_left(joined_points, last))
+        meetings = [first, *joined_points[inner_points], last]
         cuts = list(meetings)
         for start, stop in pairwise(meetings):
             # No piece at the end has fewer points than _LEAST_POINTS.
@@ -242,7 +242,7 @@ def _joints(stretches: Sequence[tuple[int, int]], earlier_points: IntArray) -> d
     """Find the ends of stretches that meet an earlier stretch, and the points where they meet it.
 
     Args:
-        stretches: Indices of the first and the last point of each stretch.
+        stretches: Indices of the first and the last point of each stretch, in ascending order.
         earlier_points: First point driven at the place of each point; -1 if there is none. (n,)
 
     Returns:
@@ -251,16 +251,19 @@ def _joints(stretches: Sequence[tuple[int, int]], earlier_points: IntArray) -> d
     """
     joints = {}
     ends = [point for stretch in stretches for point in stretch]
+    last_points = [last for _, last in stretches]
     for end in ends:
         meeting = int(earlier_points[end])  # -1, without an earlier pass, is in no stretch
-        for first, last in stretches:
-            if first <= meeting <= last:
-                if meeting - first < _LEAST_POINTS:
-                    meeting = first
-                elif last - meeting < _LEAST_POINTS:
-                    meeting = last
-                joints[end] = meeting
-                break
+        # The first stretch that ends at this point or later, if there is one.
+        index = bisect_left(last_points, meeting)
+        if index == len(stretches) or meeting < stretches[index][0]:
+            continue
+        first, last = stretches[index]
+        if meeting - first < _LEAST_POINTS:
+            meeting = first
+        elif last - meeting < _LEAST_POINTS:
+            meeting = last
+        joints[end] = meeting
     return joints
 
 
