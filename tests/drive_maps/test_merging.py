@@ -62,6 +62,23 @@ def test_an_area_of_exactly_the_smallest_size_is_kept():
         assert len(merge_areas(drive, 1, MergeConfig(min_area_confidence=0.0))) == kept
 
 
+def one_frame_of(rings, scores):
+    """A frame at the origin with crossings."""
+    sample = replace(drive_of().frames[0].sample, global_from_frame=np.eye(4))
+    elements = MapElements.from_polylines(rings, [1] * len(rings), scores)
+    return replace(drive_of(), frames=[DriveFrame(sample, elements)])
+
+
+@pytest.mark.parametrize("y", [0.0, -7.0])  # -7: over the vehicle
+@pytest.mark.parametrize(("first", "area_m2"), [([[-2, 5], [2, 5]], 16), ([[2, 5], [-2, 5]], 8)])
+def test_a_crossing_with_an_edge_that_runs_back_is_merged_without_the_edge(first, area_m2, y):
+    """A square and a bow of two triangles, with an edge of 2 m there and back."""
+    ring = np.array([*first, [2, 9], [2, 11], [2, 9], [-2, 9], first[0]])
+    found = merge(one_frame_of([np.add(ring, [0, y])], [0.9]))
+    assert sum(shapely.Polygon(line).area for line in found.polylines) == pytest.approx(area_m2)
+    assert found.scores.tolist() == pytest.approx([0.9] * len(found))
+
+
 def test_merging_beats_suppression_on_noisy_frames():
     drive = drive_of(noise_m=0.3, scored=True)
     true = true_map(drive_of())

@@ -166,13 +166,9 @@ def _added(
 def _polygons(rings: list[FloatArray]) -> list[shapely.Polygon]:
     """Convert rings to valid polygons, with `polygons_of`.
 
-    A ring that crosses itself becomes several polygons. `polygons_of` returns one multipolygon for
-    it, and omits rings with a tiny area.
+    A ring that crosses itself becomes several polygons. Rings with a tiny area are left out.
     """
-    polygons = []
-    for part in shapely.get_parts(np.array(polygons_of(rings), dtype=object)):
-        if isinstance(part, shapely.Polygon):  # the repair of a ring may also give lines
-            polygons.append(part)
+    polygons: list[shapely.Polygon] = shapely.get_parts(polygons_of(rings)).tolist()
     return polygons
 
 
@@ -254,9 +250,9 @@ def _detections(passes: list[Pass], label: int, config: MergeConfig) -> list[_De
             variances = []
             for index in np.flatnonzero(elements.labels == label).tolist():
                 vertices = slice(elements.offsets[index], elements.offsets[index + 1])
-                # The ring gives one area, or none if its area is tiny. A ring that crosses itself
-                # becomes one multipolygon. Its parts are not separated as in `_polygons`, because
-                # only overlaps and the centre are used.
+                # The ring gives one multipolygon, or none if its area is tiny. The parts of a ring
+                # that crosses itself are not separated as in `_polygons`, because only overlaps and
+                # the centre are used.
                 for area in polygons_of([elements.points[vertices]]):
                     areas.append(area)
                     scores.append(float(elements.confidence[index]))

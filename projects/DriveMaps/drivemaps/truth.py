@@ -71,14 +71,17 @@ def polygons_of(rings: Sequence[FloatArray]) -> list[shapely.Geometry]:
         rings: Vertices of the rings in metres. each (n, 2)
 
     Returns:
-        Valid polygons or multipolygons. From a ring that runs back along itself, there may also be
-        a collection of polygons and lines.
+        Valid multipolygons.
     """
     areas = []
     for ring in rings:
         if len(ring) < 3:
             continue
-        area = shapely.make_valid(shapely.Polygon(ring))
+        # A ring that runs back along itself becomes a collection of polygons, multipolygons and
+        # lines. The second `get_parts` splits the multipolygons. The lines are left out.
+        parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(shapely.Polygon(ring))))
+        polygons = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
+        area = shapely.multipolygons(polygons)
         if area.area >= MIN_AREA_M2:
             areas.append(area)
     return areas
@@ -87,7 +90,6 @@ def polygons_of(rings: Sequence[FloatArray]) -> list[shapely.Geometry]:
 def _unite_areas(rings: Sequence[FloatArray]) -> list[FloatArray]:
     """Outer rings of the union of areas. each (n, 2)"""
     parts = shapely.get_parts(shapely.union_all(polygons_of(rings), grid_size=GRID_M))
-    # Parts that are lines have no area, so they are left out, too.
     return [shapely.get_coordinates(p.exterior) for p in parts if p.area >= MIN_AREA_M2]
 
 
