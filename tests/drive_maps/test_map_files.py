@@ -260,6 +260,8 @@ def test_a_lanelet2_map_of_another_program_is_read_by_its_types(tmp_path):
         relation(20, {"left": 12, "right": 13}, type="lanelet", subtype="crosswalk"),
         relation(21, {"left": 10, "right": 11}, type="lanelet", subtype="road"),
         relation(22, {}, type="regulatory_element"),
+        relation(23, {"ref_line": 12}, type="regulatory_element", subtype="crosswalk"),
+        relation(24, {"outer": 17}, type="multipolygon", subtype="crosswalk"),
         "<way id='19' action='delete'/><bounds minlat='1'/>",
     ]
     path.write_text(osm("".join(body)))
@@ -276,7 +278,8 @@ def test_a_lanelet2_map_of_another_program_is_read_by_its_types(tmp_path):
         "class ''": 1,
         "ped_crossing that is an open line": 1,
         "relation 'lanelet'": 1,
-        "relation 'regulatory_element'": 1,
+        "relation 'regulatory_element'": 2,
+        "relation 'multipolygon'": 1,
         "deleted way": 1,
     }
     rule = ClassRule.parse(["type", "traffic_sign=boundary"], CLASSES)

@@ -353,7 +353,10 @@ class _Parser:
         """Lanelets of the subtype ``crosswalk``, by their IDs."""
         crosswalks = {}
         for relation_id, relation in self.relations.items():
-            if relation.tags.get("subtype") == "crosswalk":
+            tags = relation.tags
+            # Autoware adds a regulatory element of this subtype to each crosswalk.
+            is_lanelet = tags.get("type", "lanelet") == "lanelet"
+            if is_lanelet and tags.get("subtype") == "crosswalk":
                 crosswalks[relation_id] = relation
         return crosswalks
 
