@@ -117,6 +117,18 @@ def test_lines_of_a_straight_road(old, expected):
     assert found.num_not_in_view == not_in_view
 
 
+@pytest.mark.parametrize(("width", "height"), [(14, 4), (16, 4), (14, 70)])
+def test_a_removed_area_is_as_sure_if_no_frame_has_it_whole_in_range(width, height):
+    """A frame has 15 m to each side and 60 m along the road in range."""
+    drive = straight_drive([UP], [0], np.arange(0.0, 101.0, 4.0))
+    corners = np.array([[-1, 0], [1, 0], [1, 1], [-1, 1], [-1, 0]])
+    area = corners * [width, height] + [0, 15]
+    one_pass = Pass(drive, map_of([(0, UP)]))
+    (change,) = find_changes(map_of([(0, UP), (1, area)]), [one_pass]).changes
+    assert (change.kind, change.passes_in_view) == ("removed", 1)
+    assert change.confidence == pytest.approx(0.87, abs=0.03)  # n / (n + 2) of 11 to 17 frames
+
+
 def test_few_views_and_new_ground_are_no_changes():
     for num_frames in (MIN_VIEWS - 1, MIN_VIEWS):
         drive = straight_drive([UP], [0], np.arange(num_frames) * 0.1)

@@ -76,15 +76,14 @@ def area_changes(
         is_seen = _passes_that_have(area, new_areas)
         num_in_view = int(in_view.sum())
         num_missing = int((in_view & ~is_seen).sum())
-        views, matches = _views_of(outline, area=area, detections=detections)
-        score_sum = sum(matches.scores)
+        views, support, matches = _views_of(outline, area=area, detections=detections)
         # More than half of the passes with the area in view do not have it in their map.
         is_removed = 2 * num_missing > num_in_view
         if is_removed:
             # This is the number of frames that do not show the area. A frame with a detection of
             # score s counts as 1 - s frames without the area. `smooth_share` divides the number by
             # the number of frames with the area in view, and lowers the share if these are few.
-            num_without = views - score_sum
+            num_without = views - support
             change = Change(
                 REMOVED,
                 label,
@@ -100,7 +99,7 @@ def area_changes(
             # `exceeds` also requires that the shift is large compared to its standard error.
             if new_area is None or not shift.exceeds(_MIN_MOVE_M):
                 continue
-            share = smooth_share(score_sum, views)  # of the frames that detect the area
+            share = smooth_share(support, views)  # of the frames that detect the area
             change = Change(
                 MOVED,
                 label,
@@ -266,7 +265,7 @@ def _detections(passes: list[Pass], label: int, config: MergeConfig) -> list[_De
 
 @dataclass
 class _Matches:
-    """Detections of one area, at most one for each frame.
+    """Detections of one area, at most one for each frame that has the whole area in range.
 
     Attributes:
         centres: Centre of each detection in metres. (2,)
@@ -281,8 +280,10 @@ class _Matches:
 
 def _views_of(
     outline: FloatArray, area: shapely.Polygon, detections: list[_Detections]
-) -> tuple[int, _Matches]:
-    """Count the frames that have a whole area in range, and find the area's detections in them.
+) -> tuple[float, float, _Matches]:
+    """Count the frames that have an area in range, and find the area's detections in them.
+
+    A frame with a part of the outline in range counts as this part of a frame.
 
     Args:
         outline: Points of the outline. (n, 2)
@@ -290,22 +291,27 @@ def _views_of(
         detections: Predicted areas of all frames of the passes.
 
     Returns:
-        Number of frames with the whole area in range, and the best detection of each of these
-        frames that has one.
+        Number of frames with the area in range, sum of the scores of the best detection in each of
+        these frames, and the detections in the frames with the whole area in range.
     """
-    views = 0
+    views = 0.0
+    support = 0.0
     matches = _Matches()
     for entry in detections:
-        if not entry.drive.in_range(entry.frame, outline).all():
+        share_in_range = float(entry.drive.in_range(entry.frame, outline).mean())
+        if share_in_range == 0.0:
             continue
-        views += 1
+        views += share_in_range
         shares = _shared_shares(area, entry.areas)
         if shares.max(initial=0.0) >= _MIN_OVERLAP:
             best = int(shares.argmax())
-            matches.centres.append(shapely.get_coordinates(entry.areas[best].centroid)[0])
-            matches.scores.append(entry.scores[best])
-            matches.variances.append(entry.variances[best])
-    return views, matches
+            support += share_in_range * entry.scores[best]
+            # The centre of a detection is not that of the area if a part of it is out of range.
+            if share_in_range == 1.0:
+                matches.centres.append(shapely.get_coordinates(entry.areas[best].centroid)[0])
+                matches.scores.append(entry.scores[best])
+                matches.variances.append(entry.variances[best])
+    return views, support, matches
 
 
 def _shift_of(area: shapely.Polygon, matches: _Matches) -> Shift:

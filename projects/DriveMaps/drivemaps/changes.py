@@ -55,7 +55,8 @@ def find_changes(
       elsewhere the old map may not cover the ground.
     * Moved: a part of a line of the old map beside which the maps of the passes have a line, on one
       side and at a mean distance of at least 0.5 m, or an area of the old map whose centre moved by
-      at least 0.75 m. The shift must also be at least five standard errors.
+      at least 0.75 m, in three or more frames with the whole area in range. The shift must also be
+      at least five standard errors.
 
     Lines of the old map with a score below 0.4 are never reported as removed or moved, but they
     show that a line of a pass is not new. Lines of a pass with a score below 0.6 are never reported
