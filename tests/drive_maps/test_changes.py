@@ -145,6 +145,27 @@ def test_few_views_and_new_ground_are_no_changes():
     assert empty.changes == []
 
 
+def test_long_straight_lines_and_wide_areas_in_view_are_compared():
+    """Their vertices lie far from the drive, or from the old map."""
+    drive = straight_drive([UP], [0], np.arange(0.0, 39.0, 2.0))
+    long = UP * 5 - [0, 200]
+    ring = np.array([[-1, 15], [1, 15], [1, 19], [-1, 19], [-1, 15]])
+    rows = [
+        (0, long),
+        (0, np.add(long, [3, 0])),
+        (1, ring * [16, 1]),
+        (1, ring * [20, 1]),
+        (0, UP + 150),
+    ]
+    found = find_changes(map_of(rows), [Pass(drive, map_of([(0, long)]))])
+    assert summarize_changes(found) == (
+        "2 removed, 0 added, 0 moved (not compared: 1 divider, 1 ped_crossing of the old map not "
+        "in view)"  # the last divider, and a crossing with 70 percent of its outline in view
+    )
+    new = find_changes(map_of([(0, beside(0, 0.2))]), [Pass(drive, map_of([(0, long)]))])
+    assert summarize_changes(new) == "0 removed, 2 added, 0 moved"  # before and after it
+
+
 def test_the_error_of_a_shift_by_hand():
     """Weights 3 : 1; the mean of 1 and 2 m is 1.25 m."""
     shift = Shift.of_frames(np.array([1.0, 2.0]), np.array([0.01, 0.03]), np.array([3.0, 1.0]))

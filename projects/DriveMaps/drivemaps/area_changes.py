@@ -27,8 +27,9 @@ from drivemaps.drive import Drive, DriveFrame
 from drivemaps.truth import polygons_of
 from gsmap.structures.elements import BoolArray, FloatArray, MapElements
 
+MIN_SHARE_IN_VIEW = 0.8
+"""A pass has an area in view if it has at least this part of the outline in view."""
 _MIN_OVERLAP = 0.3  # two areas are one object if they share at least this part of the smaller one
-_MIN_SHARE = 0.8  # a pass has an area in view if it has at least this part of the outline in view
 _MIN_MOVE_M = 0.75  # an area has moved if its centre is shifted by at least this
 _MIN_FRAMES = 3  # smallest number of frames with a detection that can show that an area has moved
 _STEP_M = 1.0  # largest distance between successive points of an outline
@@ -233,7 +234,7 @@ def _largest_overlap(
 def _passes_in_view(outline: FloatArray, passes: list[Pass]) -> BoolArray:
     """Whether each pass has an outline in view. (n, 2) -> (passes,)"""
     is_in_view = views_of_passes(outline, passes) >= MIN_VIEWS
-    in_view: BoolArray = is_in_view.mean(axis=1) >= _MIN_SHARE
+    in_view: BoolArray = is_in_view.mean(axis=1) >= MIN_SHARE_IN_VIEW
     return in_view
 
 

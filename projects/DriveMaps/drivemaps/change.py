@@ -73,8 +73,9 @@ class Changes:
         changes: The changes, sorted by class and then by kind.
         num_on_new_ground: Number of elements of the passes on ground that the old map does not
             cover, by class name. They do not count as changes.
-        num_not_in_view: Number of elements of the old map without a vertex in view of any pass, by
-            class name.
+        num_not_in_view: Number of elements of the old map that no pass has in view, by class name:
+            lines without a point in view, and areas with less than 80 percent of their outline in
+            view.
     """
 
     changes: list[Change]

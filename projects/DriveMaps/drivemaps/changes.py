@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drivemaps.area_changes import area_changes
+from drivemaps.area_changes import MIN_SHARE_IN_VIEW, area_changes
 from drivemaps.change import (
     KINDS,
     MIN_VIEWS,
@@ -29,8 +29,15 @@ from drivemaps.config import MergeConfig
 from drivemaps.geodetic import MapGrid, MapOrigin
 from drivemaps.geojson import write_features
 from drivemaps.line_changes import line_changes
+from drivemaps.line_matching import sample_line
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import MAX_TOTAL_LENGTH_M, MapElements
+from gsmap.structures.elements import (
+    MAX_TOTAL_LENGTH_M,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    MapElements,
+)
 from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
@@ -83,7 +90,8 @@ def find_changes(
     # Changes are searched only near the drives. The whole map is needed to count the elements that
     # no pass has in view.
     whole_map = old
-    old = _near_passes(old, passes)
+    is_near = _are_near_passes(old, passes)
+    old = old.select(is_near)
     changes: list[Change] = []
     for label, name in enumerate(classes):
         find_in_class = area_changes if name in AREA_CLASSES else line_changes
@@ -95,24 +103,45 @@ def find_changes(
     changes.sort(key=lambda change: (change.label, KINDS.index(change.kind), -change.confidence))
     num_on_new_ground: Counter[str] = Counter()
     for one_pass in passes:
-        for line, label, _ in one_pass.elements.rows:  # vertices, class index and score
-            # Known ground is within 30 m of an element of the old map.
-            if not on_known_ground(line, old).any():
-                num_on_new_ground[classes[label]] += 1
-    num_not_in_view: Counter[str] = Counter()
-    # For each of the M vertices of the map: the number of frames that have it in range, in the pass
-    # with the most such frames. (M,)
-    most_views = views_of_passes(whole_map.points[:, :2], passes).max(axis=0)
-    for index, label in enumerate(whole_map.labels.tolist()):
-        vertices = slice(whole_map.offsets[index], whole_map.offsets[index + 1])
-        # A point is in view from MIN_VIEWS frames on. An element without vertices has 0 views.
-        if most_views[vertices].max(initial=0) < MIN_VIEWS:
-            num_not_in_view[classes[label]] += 1
+        elements = one_pass.elements
+        points, owners = _sample(elements)
+        # Known ground is within 30 m of an element of the old map.
+        is_known = np.zeros(len(elements), dtype=np.bool_)
+        is_known[owners[on_known_ground(points, old)]] = True
+        num_on_new_ground.update(classes[label] for label in elements.labels[~is_known])
+    # Elements of the old map that are far from the passes are not in view.
+    is_in_view = np.zeros(len(whole_map), dtype=np.bool_)
+    is_in_view[is_near] = _are_in_view(old, passes)
+    num_not_in_view = Counter(classes[label] for label in whole_map.labels[~is_in_view])
     return Changes(changes, dict(num_on_new_ground), num_not_in_view=dict(num_not_in_view))
 
 
-def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
-    """Select the elements of an old map whose bounding boxes are near the drives.
+def _sample(elements: MapElements) -> tuple[FloatArray, IntArray]:
+    """Sample elements every metre. Returns points (M, 2) and the index of their element (M,)."""
+    points = [np.zeros((0, 2))]
+    counts = []
+    for line in elements.polylines:
+        samples = sample_line(line[:, :2])[0] if len(line) else points[0]
+        points.append(samples)
+        counts.append(len(samples))
+    return np.concatenate(points), np.repeat(np.arange(len(elements)), counts)
+
+
+def _are_in_view(elements: MapElements, passes: list[Pass]) -> BoolArray:
+    """Whether any pass has each line in part, or each area to at least 80 percent in view. (N,)"""
+    points, owners = _sample(elements)
+    num_elements = len(elements)
+    num_points = np.bincount(owners, minlength=num_elements)
+    share = np.zeros(num_elements)  # part of each element that is in view, in the best pass
+    for views in views_of_passes(points, passes):
+        num_in_view = np.bincount(owners, views >= MIN_VIEWS, minlength=num_elements)
+        share = np.maximum(share, num_in_view / num_points)
+    is_area = np.array([name in AREA_CLASSES for name in passes[0].drive.classes])
+    return np.where(is_area[elements.labels], share >= MIN_SHARE_IN_VIEW, share > 0.0)
+
+
+def _are_near_passes(old: MapElements, passes: Sequence[Pass]) -> BoolArray:
+    """Whether the bounding box of each element of an old map is near the drives. (N,)
 
     Raises:
         ValueError: If the total length of their lines is too large. The lines are later sampled
@@ -143,7 +172,7 @@ def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
             f"the old map has {total_m / 1000:.0f} km of lines near the drives: at most "
             f"{MAX_TOTAL_LENGTH_M / 1000:g} km are compared; cut it to the place."
         )
-    return old.select(is_near)
+    return is_near
 
 
 def write_changes(
