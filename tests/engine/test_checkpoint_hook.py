@@ -416,9 +416,9 @@ def test_a_checkpoint_holds_the_models_settings_and_no_text_that_runs(tmp_path):
 class Sized(list):
     """Samples of a data set whose scaled images have a size."""
 
-    def __init__(self, width: int, *, signals: bool = True):
+    def __init__(self, width: int | None, *, signals: bool = True):
         super().__init__([{"inputs": torch.ones(1)}])
-        self.scaled_image_size = lambda: (width, 9)
+        self.scaled_image_size = lambda: width and (width, 9)
         self.has_signals = lambda: signals
 
 
@@ -428,6 +428,8 @@ def test_the_images_of_several_data_sets_are_noted_if_they_agree(tmp_path):
     checkpoint = read_checked(tmp_path / "equal/epoch_1.pth")
     assert checkpoint.image_size == (16, 9)
     assert checkpoint.can_bus
+    learn(tmp_path / "none", 1, train=Sized(None))  # LiDAR alone
+    assert read_checked(tmp_path / "none/epoch_1.pth").image_size is None
     learn(tmp_path / "mixed", 1, train=ConcatDataset([Sized(16), Sized(32, signals=False)]))
     checkpoint = read_checked(tmp_path / "mixed/epoch_1.pth")
     assert checkpoint.image_size is None

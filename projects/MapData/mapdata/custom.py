@@ -25,7 +25,7 @@ from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name
-from gsmap.utils.shards import WHOLE, Shard
+from gsmap.utils.shards import WHOLE, Shard, digest
 from mapdata.calibrated import calibrated_records
 from mapdata.folders.rig import RigCamera
 from mapdata.local_map import POLYGON, vertices_of
@@ -333,10 +333,9 @@ def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
     where = f"camera {rig_camera.name!r}"
     source = path_below(root, name=camera["path"], noun=f"{where}: the path")
     # The digest keeps images apart that have another calibration, or whose source was replaced.
-    digest = hashlib.sha256(repr(calibration).encode())
-    if source.is_file():  # `read_image` below raises the error for a missing one
-        digest.update(source.read_bytes())
-    name = f"{file_name(camera['path'])}-{digest.hexdigest()[:12]}.jpg"
+    content = digest(source) if source.is_file() else ""  # a missing one raises an error below
+    version = hashlib.sha256(f"{calibration} {content}".encode()).hexdigest()[:12]
+    name = f"{file_name(camera['path'])}-{version}.jpg"
     path = f"rectified/{file_name(rig_camera.name)}/{name}"
     target = root / path
     if not target.is_file():

@@ -88,8 +88,7 @@ def read_places(paths: Sequence[Path]) -> Places:
         # A conversion that does not know the names of the maps writes the scene as map name, or no
         # name.
         has_common_maps = file_scenes != file_maps and "" not in file_maps
-        # In a file of samples without known poses, the option "poses" is False.
-        if not file.meta.options.get("poses", True) or not has_common_maps:
+        if not file.meta.has_poses or not has_common_maps:
             raise InputError(
                 f"{path} does not say where its samples are on common maps: make it from the data "
                 "set itself, not from info files or pictures, and give records a map_name."

@@ -82,13 +82,19 @@ def _described_datasets(runner: Runner) -> list[Any]:
     return [dataset for dataset in datasets if hasattr(dataset, "scaled_image_size")]
 
 
+def _image_sizes(datasets: list[Any]) -> set[tuple[int, int]]:
+    """Return the sizes of the scaled images; none for data sets without images."""
+    sizes = {dataset.scaled_image_size() for dataset in datasets}
+    return sizes - {None}
+
+
 def _image_facts(runner: Runner) -> dict[str, Any]:
     """Return the size of the scaled training images, and whether some samples have signals.
 
-    There is no size if the training data sets have several ones.
+    There is no size if the training data sets have several ones, or no images.
     """
     datasets = _described_datasets(runner)
-    sizes = {dataset.scaled_image_size() for dataset in datasets}
+    sizes = _image_sizes(datasets)
     facts: dict[str, Any] = {}
     if len(sizes) == 1:
         facts[IMAGE_SIZE] = list(sizes.pop())
@@ -100,9 +106,9 @@ def _image_facts(runner: Runner) -> dict[str, Any]:
 def _warn_of_differences(runner: Runner) -> None:
     """Log a warning if the training data sets differ in facts that the checkpoints store."""
     datasets = _described_datasets(runner)
-    sizes = sorted({dataset.scaled_image_size() for dataset in datasets})
+    sizes = _image_sizes(datasets)
     if len(sizes) > 1:
-        texts = [f"{width} x {height}" for width, height in sizes]
+        texts = [f"{width} x {height}" for width, height in sorted(sizes)]
         runner.logger.warning(
             f"The training data sets have scaled images of {' and '.join(texts)} pixels, so the "
             "checkpoints store no size, and inference scales images as its config says."
