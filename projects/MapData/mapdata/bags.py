@@ -231,8 +231,9 @@ def _topics_of(
     images = by_hand or image_topics(kinds)
     topics = {}
     for camera, images_setting in calibrated_cameras:
-        topic = by_hand.get(camera.name)
-        if topic is None:
+        if camera.name in by_hand:
+            topic = by_hand[camera.name]
+        else:
             topic = _topic_of(camera.name, images_setting, images=images, kinds=kinds)
         topics[camera.name] = (topic, "")
     return topics
