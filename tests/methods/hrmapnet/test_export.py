@@ -1,10 +1,12 @@
 """An exported model: the window is an input, and the writing is outside."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from export_cases import POINTS_M, SCORES, shake
-from methods.hrmapnet.prior_cases import PRIOR
+from methods.hrmapnet.prior_cases import PRIOR, prior_model
 from model_cases import IMAGE_SHAPE, build_small, small_config
 from prior_cases import CLASSES, frames
 
@@ -13,6 +15,7 @@ from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.prior import KeepMaximum, MapPrior, PriorSettings
 from gsmap.prior.places import Place
+from tools import export
 
 for _package in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(_package, reason=f"{_package} is not installed: pip install -e .[onnx]")
@@ -63,3 +66,18 @@ def test_a_file_reads_the_window_as_in_torch(tmp_path):
     for wrong in (window[:2], window + 1.0, window * np.nan):
         with pytest.raises(ValueError, match=r"prior of model\.onnx must have values in \[0, 1\]"):
             exported(IMAGES, {**meta, "prior": wrong})
+
+
+def test_a_check_compares_with_an_empty_map_for_all_samples(monkeypatch):
+    model = prior_model().eval()
+    maps = []
+    inferencer = SimpleNamespace(
+        model=model, predict=lambda *_: maps.append(model.prior.new_maps()) or []
+    )
+    samples = SimpleNamespace(annotations=SimpleNamespace(column=lambda _: ["a", "b"]))
+    monkeypatch.setattr(export, "open_samples", lambda *_, **__: samples)
+    monkeypatch.setattr(export, "graph_inputs", lambda *_: [])
+    options = SimpleNamespace(samples=None, check=2, results=None)
+    text = export.check(inferencer, SimpleNamespace(metadata={}), options)
+    assert "predict, with an empty map of earlier drives, equal numbers" in text
+    assert not maps[0].writes
