@@ -327,7 +327,8 @@ def run_settings(args: argparse.Namespace) -> dict[str, str]:
     """Settings of the command that determine the predictions of a sample, by name."""
     checkpoint = chosen_checkpoint(args)
     settings = {"model": args.model[0], "checkpoint": digest(checkpoint)}
-    for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp"):
+    names = ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp", "update_prior")
+    for name in names:
         settings[name] = str(getattr(args, name))
     for path in args.prior:
         settings[f"prior {path.resolve()}"] = digest(path) if path.exists() else "new"
@@ -449,12 +450,13 @@ def read_priors(
         return []
     from gsmap.apis.map_priors import open_priors
 
+    names = dataset.annotations.column("map_name")  # each is empty if unknown
     return open_priors(
         inferencer.model,
         args.prior,
         stack,
         update=args.update_prior,
-        new_place=place_of(dataset, chosen, args.prior[0]),
+        places={names[index] for index in chosen},
     )
 
 
@@ -465,29 +467,6 @@ def save_priors(args: argparse.Namespace, priors: Sequence["AnyPrior"]) -> None:
     for prior, path in zip(priors, args.prior, strict=True):
         prior.save(path)
     print(f"updated: {', '.join(map(str, args.prior))}")
-
-
-def place_of(dataset: "VectorizedMapDataset", chosen: Sequence[int], path: Path) -> str:
-    """Name of the place of samples; the file name without suffix if the place is unknown.
-
-    A prior belongs to one place. A file that is created gets this name.
-
-    Args:
-        dataset: The samples.
-        chosen: Indices of the samples to predict.
-        path: File of a prior.
-
-    Raises:
-        ValueError: If the file does not exist and the samples are in several places.
-    """
-    all_names = dataset.annotations.column("map_name")  # empty if unknown
-    names = sorted({all_names[index] for index in chosen})
-    if len(names) > 1 and not path.exists():
-        raise InputError(
-            f"{path} does not exist, and the samples are in {', '.join(names)}: make the prior of "
-            "each place from the samples of this place alone, by --token or a separate input."
-        )
-    return (names[0] if names else "") or path.stem
 
 
 def draw(

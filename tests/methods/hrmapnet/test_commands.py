@@ -1,15 +1,18 @@
 """``infer --prior``, ``test --prior`` and a resumed training, on a tiny MiniCity."""
 
 import json
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from methods.hrmapnet.prior_cases import prior_model
 from mmdet3d.registry import MODELS
 from prior_cases import CLASSES
 from processes import run_tool
 
+from gsmap.apis.map_priors import open_priors
 from gsmap.engine.launch import read_config
 from gsmap.prior import LastSeen, MapPrior, PriorSettings, open_prior
 from gsmap.utils.shards import digest
@@ -107,6 +110,35 @@ def test_priors_that_do_not_fit_are_refused(model, tiny_config, minicity_annotat
         run(whole, of=[str(tiny_config), str(weights)])
     with pytest.raises(SystemExit):
         infer.parse_args([drive, "--model", *model, "--out", out, "--update-prior"])
+
+
+def test_a_new_prior_is_of_the_place_without_one(tmp_path):
+    model = prior_model().eval()
+    first, second, third = (tmp_path / name for name in ("first.prior", "second.prior", "third"))
+
+    def open_for(paths, *places):
+        with ExitStack() as stack:
+            priors = open_priors(model, paths, stack, update=True, places=places)
+            return [prior.settings.place for prior in priors]
+
+    assert open_for([first], "oslo") == ["oslo"]
+    assert open_for([second, first], "oslo", "bergen") == ["bergen", "oslo"]
+    assert open_for([third], "") == ["third"]
+    third.unlink()
+    for paths, places, reason in (
+        ([third, first], ["oslo"], "third does not exist, and the .* are in no other place: make"),
+        ([first, third], ["oslo", "a", ""], "are in a, an unknown place: make the prior of each"),
+        ([third, tmp_path / "fourth"], ["a", "b"], "third and .*fourth do not exist, .* in a, b:"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            open_for(paths, *places)
+        assert not third.exists()
+
+
+def test_predictions_of_a_run_without_update_are_not_used_with_it(model):
+    words = ["drive", "--model", *model, "--out", "map.json", "--prior", "town.prior"]
+    plain = infer.run_settings(infer.parse_args(words))
+    assert infer.run_settings(infer.parse_args([*words, "--update-prior"])) != plain
 
 
 def test_a_gaussian_prior_of_a_drive_is_read(model, minicity_annotations, tmp_path, capsys):

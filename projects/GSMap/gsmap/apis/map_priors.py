@@ -3,7 +3,7 @@
 A map prior is the map of a place from earlier drives. The model reads it as a further input.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,7 +61,11 @@ def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
 
 
 def open_priors(
-    model: Any, paths: Sequence[Path], stack: ExitStack, update: bool = False, new_place: str = ""
+    model: Any,
+    paths: Sequence[Path],
+    stack: ExitStack,
+    update: bool = False,
+    places: Collection[str] = (),
 ) -> "list[AnyPrior]":
     """Open files of priors until the end of a context.
 
@@ -71,8 +75,9 @@ def open_priors(
         paths: The files.
         stack: Context that closes the priors at its end.
         update: Whether to reserve the files, so that they can be saved later. A file that does not
-            exist is then created.
-        new_place: Name of the place of a file that is created.
+            exist is then created, for the place that the other files do not have.
+        places: Places of the samples. An unknown place is an empty name, in whose stead a created
+            file gets its own name without suffix.
 
     Returns:
         The priors in the order of ``paths``; open until the end of ``stack``.
@@ -80,19 +85,45 @@ def open_priors(
     Raises:
         FileNotFoundError: If a file does not exist and is not to be updated.
         ValueError: If the model takes no prior, if a file is no valid prior, or if a file is to be
-            created and the model writes to no prior.
+            created and the model writes to no prior or the place of the file is not certain.
         RuntimeError: If a file is reserved by another process.
     """
     from gsmap.prior.opening import open_prior
 
     require_prior(model)
-    priors: list[AnyPrior] = []
-    for path in paths:
-        if update and not path.exists():
-            with model.prior.new_prior(new_place) as empty_prior:
+    new_paths = [path for path in paths if update and not path.exists()]
+    priors: dict[Path, AnyPrior] = {}
+    # Files that are created come last, because the places of the others decide on theirs.
+    for path in sorted(paths, key=new_paths.__contains__):
+        if path in new_paths:
+            known_places = [prior.settings.place for prior in priors.values()]
+            place = _new_place(new_paths, set(places).difference(known_places))
+            with model.prior.new_prior(place) as empty_prior:
                 empty_prior.save(path)
         prior = open_prior(path, update=update)
         if isinstance(prior, MapPrior):  # priors of other types keep no file open
             stack.enter_context(prior)
-        priors.append(prior)
-    return priors
+        priors[path] = prior
+    return [priors[path] for path in paths]
+
+
+def _new_place(paths: Sequence[Path], places: Collection[str]) -> str:
+    """Name of the place of a prior that is created.
+
+    Args:
+        paths: All files that are to be created.
+        places: Places of the samples that have no prior; an empty name if the place is unknown.
+
+    Raises:
+        ValueError: If there is not exactly one file and one place.
+    """
+    if len(paths) == len(places) == 1:
+        (place,) = places
+        return place or paths[0].stem
+    subject = f"{paths[0]} does" if len(paths) == 1 else f"{' and '.join(map(str, paths))} do"
+    names = ", ".join(sorted(place or "an unknown place" for place in places))
+    raise InputError(
+        f"{subject} not exist, and the samples without a prior are in {names or 'no other place'}: "
+        "make the prior of each place from the samples of this place alone, by --token or a "
+        "separate input."
+    )
