@@ -13,6 +13,7 @@ import argparse
 import json
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from mmengine.config import Config
 
@@ -72,17 +73,39 @@ def parse_args() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def metric_settings(cfg: Config) -> list[dict[str, Any]]:
+    """Settings of the metrics of the test, with `MapMetric` or a metric derived from it first."""
+    from mmdet3d.registry import METRICS
+
+    from gsmap.engine.targets import class_of_type
+    from gsmap.evaluation.map_metric import MapMetric
+
+    metrics = cfg.get("test_evaluator") or []
+    if isinstance(metrics, dict):
+        metrics = metrics.get("metrics", {"type": "MapMetric", **metrics})
+    if isinstance(metrics, dict):
+        metrics = [metrics]
+    first: list[dict[str, Any]] = []
+    others: list[dict[str, Any]] = []
+    for metric in metrics:
+        metric_class = class_of_type(metric.get("type"), registry=METRICS) or object
+        (first if issubclass(metric_class, MapMetric) else others).append(metric)
+    return [*(first or [{"type": "MapMetric"}]), *others]
+
+
 def apply_options(cfg: Config, args: argparse.Namespace) -> None:
     """Apply the options of this command to the config, in place."""
     cfg.resume = False  # only weights are loaded, not the state of a training
+    map_metric, *others = metric_settings(cfg)
     map_metric = {
-        "type": "MapMetric",
-        **(cfg.get("test_evaluator") or {}),  # settings of the config
+        **map_metric,
         "eval": args.eval,
         "out_file": str(args.out) if args.out else None,
     }
     # `GaussianMetric` adds statistics of predicted Gaussians.
-    cfg.test_evaluator = [map_metric, {"type": "GaussianMetric"}]
+    if all(metric.get("type") != "GaussianMetric" for metric in others):
+        others.append({"type": "GaussianMetric"})
+    cfg.test_evaluator = [map_metric, *others]
     if args.allow_other_split:
         cfg.default_hooks.checkpoint.allow_other_split = True
     if args.show_dir:

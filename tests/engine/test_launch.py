@@ -153,6 +153,24 @@ def test_a_cosine_schedule_of_another_length_is_refused():
     check_config(Config(cfg))
 
 
+@pytest.mark.parametrize(
+    ("wrap", "name"),
+    [
+        (lambda scheduler: scheduler, "param_scheduler"),
+        (lambda scheduler: [{"by_epoch": False}, scheduler], "param_scheduler.1"),
+        (lambda scheduler: {"a": scheduler}, "param_scheduler.a"),
+        (lambda scheduler: {"a": [], "b": [scheduler]}, "param_scheduler.b.0"),
+    ],
+)
+def test_a_cosine_schedule_may_follow_a_warm_up(wrap, name):
+    cfg = {"train_cfg": {"max_epochs": 24}}
+    cfg["param_scheduler"] = wrap({"begin": 4, "T_max": 20})
+    check_config(Config(cfg))
+    cfg["param_scheduler"] = wrap({"begin": 4, "T_max": 24})
+    with pytest.raises(ValueError, match=rf"schedule 24 and begins after 4: .* and {name}\.T_max"):
+        check_config(Config(cfg))
+
+
 def test_a_pipeline_without_a_target_of_a_head_is_refused():
     require_target("configs/maptr/maptr_r18_minicity.py", "FormatMapTargets", "MapHead")
 

@@ -12,11 +12,13 @@ pytest.importorskip("mmdet3d")
 from golden_data import CLASSES  # noqa: E402
 from mmdet3d.registry import METRICS  # noqa: E402
 from mmdet3d.structures import Det3DDataSample  # noqa: E402
+from mmengine.config import Config  # noqa: E402
 from mmengine.evaluator import Evaluator  # noqa: E402
 from mmengine.structures import InstanceData  # noqa: E402
 
 from gsmap.evaluation import map_metric  # noqa: E402
 from gsmap.evaluation.core.results_json import read_samples  # noqa: E402
+from tools.test import metric_settings  # noqa: E402
 
 RANGES = {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0)}
 
@@ -150,3 +152,19 @@ def test_a_prediction_that_is_not_finite_names_its_sample():
     broken.pred_instances_3d.pts[0, 3, 0] = float("nan")
     with pytest.raises(ValueError, match=r"sample bad.*not finite"):
         build().process([broken])
+
+
+def test_the_metrics_of_a_test_are_given_as_mmengine_takes_them():
+    plain = {"type": "MapMetric", "dim": 3}
+    dump = {"type": "DumpResults", "out_file_path": "a.pkl"}
+    for given, expected in (
+        (None, [{"type": "MapMetric"}]),
+        ({"dim": 3}, [plain]),
+        (plain, [plain]),
+        ([dump, plain], [plain, dump]),
+        ([dump], [{"type": "MapMetric"}, dump]),
+        (dump, [{"type": "MapMetric"}, dump]),
+        ({"type": "Evaluator", "metrics": [plain, dump]}, [plain, dump]),
+        ({"metrics": plain}, [plain]),
+    ):
+        assert metric_settings(Config({"test_evaluator": given})) == expected

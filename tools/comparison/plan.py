@@ -26,7 +26,7 @@ from gsmap.checkpoints.reading import read_weights
 from gsmap.checkpoints.settings import differences, plain, single_dataset_of
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
-from gsmap.engine.launch import check_config, read_config
+from gsmap.engine.launch import check_config, find_schedulers, read_config
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
@@ -272,10 +272,10 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     epochs = _count_epochs(entry, cfg, protocol=protocol, processes=processes)
     comparison_options.append(f"train_cfg.max_epochs={epochs}")
     comparison_options.append(f"train_cfg.val_interval={max(1, epochs // 4)}")
-    for index, scheduler in enumerate(cfg.get("param_scheduler") or []):
+    for name, scheduler in find_schedulers(cfg).items():
         # A cosine schedule over epochs must end with the training.
         if "T_max" in scheduler and scheduler.get("by_epoch", True):
-            comparison_options.append(f"param_scheduler.{index}.T_max={epochs}")
+            comparison_options.append(f"{name}.T_max={epochs - scheduler.get('begin', 0)}")
     options = (*comparison_options, *user_options)
     cfg = read_config(entry.config, parse_options(options))
     check_config(cfg)

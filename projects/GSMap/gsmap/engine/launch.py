@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import DATA_SAMPLERS, LOOPS, OPTIMIZERS, RUNNERS
-from mmengine.config import Config
+from mmengine.config import Config, ConfigDict
 from mmengine.logging import print_log
 from mmengine.registry import Registry, init_default_scope
 from mmengine.runner import IterBasedTrainLoop
@@ -350,19 +350,43 @@ def _check_backend(cfg: Config) -> None:
 def _check_schedule(cfg: Config) -> None:
     """Require that a cosine schedule and the training end at an equal epoch.
 
-    ``T_max`` is the last epoch of a cosine schedule.
+    ``T_max`` is the number of epochs of a cosine schedule, which starts after ``begin`` epochs.
     """
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     if end is None:
         return
-    for scheduler in cfg.get("param_scheduler") or []:
-        last = scheduler.get("T_max")
-        if last is not None and scheduler.get("by_epoch", True) and last != end:
+    for name, scheduler in find_schedulers(cfg).items():
+        length = scheduler.get("T_max")
+        if length is None or not scheduler.get("by_epoch", True):
+            continue
+        begin = scheduler.get("begin", 0)
+        if length != end - begin:
+            start = f" and begins after {begin}" if begin else ""
             raise InputError(
-                f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set "
-                "both train_cfg.max_epochs and param_scheduler's T_max, or inherit from a base "
+                f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {length}"
+                f"{start}: set both train_cfg.max_epochs and {name}.T_max, or inherit from a base "
                 "file that sets both."
             )
+
+
+def find_schedulers(cfg: Config) -> dict[str, ConfigDict]:
+    """Find the schedulers of a config, one or a list, or these of each of several optimizers.
+
+    Returns:
+        Settings of each scheduler, by dotted name.
+    """
+    settings = cfg.get("param_scheduler") or []
+    groups = {"param_scheduler": settings}
+    if isinstance(settings, dict) and all(isinstance(v, dict | list) for v in settings.values()):
+        groups = {f"param_scheduler.{name}": group for name, group in settings.items()}
+    schedulers: dict[str, ConfigDict] = {}
+    for name, group in groups.items():
+        if isinstance(group, dict):
+            schedulers[name] = group
+            continue
+        for index, scheduler in enumerate(group):
+            schedulers[f"{name}.{index}"] = scheduler
+    return schedulers
 
 
 def _check_registered(cfg: Config, component: str, registry: Registry, type_name: Any) -> None:
