@@ -46,7 +46,7 @@ from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.core.results_json import RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
-from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.cli import CommandParser, EachOnce, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_names, write_text
@@ -77,8 +77,12 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--ann", type=Path, required=True, help="annotation file (*.arrow) of the same samples"
     )
     parser.add_argument("--out", type=Path, help="folder for the maps")
-    parser.add_argument("--formats", nargs="+", default=["geojson"], choices=FORMATS)
-    parser.add_argument("--scene", nargs="+", help="drives to merge; all by default")
+    parser.add_argument(
+        "--formats", nargs="+", action=EachOnce, default=["geojson"], choices=FORMATS
+    )
+    parser.add_argument(
+        "--scene", nargs="+", action=EachOnce, help="drives to merge; all by default"
+    )
     parser.add_argument(
         "--join", action="store_true", help="merge all drives of a place into one map"
     )
@@ -193,6 +197,8 @@ def check_prior_options(parser: argparse.ArgumentParser, args: argparse.Namespac
         parser.error("--gaussians is for a --prior of results: give both, too")
     if args.gaussians and args.map:
         parser.error("a map of --map has no Gaussians: leave --gaussians out, or --map")
+    if args.gaussians and args.no_gaussians:
+        parser.error("--gaussians needs what --no-gaussians leaves out: give one of them")
     if args.elements and not args.prior:
         parser.error("--elements is for a --prior: give it, too")
     if args.elements and args.gaussians:
@@ -682,12 +688,14 @@ def main(argv: list[str] | None = None) -> str:
     scenes = args.scene or sorted(set(ann.column("scene")))
     check_options(args, ann)
     place = place_of(ann, scenes) if args.changes or args.prior else ""
+    # Without a map_name of the samples, the prior is named after its file.
+    prior_place = place or (args.prior.stem if args.prior else "")
     old = open_map(args.changes, args, ann, place) if args.changes else None
     # Maps for the prior: the map of --map, and the map of each drive.
     maps = [open_map(args.map, args, ann, place)] if args.map else []
     passes: list[Pass] = []
     results: dict[str, MapElements] = {}
-    summary = f"a prior of {place}"  # without results, the prior is the only output
+    summary = f"a prior of {prior_place}"  # without results, the prior is the only output
     if args.results:
         results = read_results(args, ann)
         groups = group_scenes(args, ann, scenes)
@@ -700,11 +708,11 @@ def main(argv: list[str] | None = None) -> str:
     if old is not None:
         compare(args, ann, old, passes)
     if args.gaussians:
-        write_gaussian_prior(args.prior, place, passes, results, args.score_thr)
+        write_gaussian_prior(args.prior, prior_place, passes, results, args.score_thr)
     elif args.elements:
-        write_element_prior(args.prior, place, ann.meta.classes, maps)
+        write_element_prior(args.prior, prior_place, ann.meta.classes, maps)
     elif args.prior:
-        write_prior(args.prior, place, ann.meta.classes, maps)
+        write_prior(args.prior, prior_place, ann.meta.classes, maps)
     if args.out and has_truth(ann):
         score(passes, ann, args.out)
     return summary

@@ -40,7 +40,7 @@ from comparison.run_curves import plot_precision_recall
 from mmengine.config import DictAction
 
 from gsmap.methods import METHODS
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, EachOnce, run_command
 from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.files import read_json, write_text
 from gsmap.utils.progress import Progress
@@ -61,7 +61,12 @@ def parse_args() -> argparse.Namespace:
         "--init", metavar="CHECKPOINT", help="checkpoint that all runs start from: file or name"
     )
     parser.add_argument(
-        "--runs", nargs="+", default=[], metavar="NAME=DIR", help="work folders of finished runs"
+        "--runs",
+        nargs="+",
+        action=EachOnce,
+        default=[],
+        metavar="NAME=DIR",
+        help="work folders of finished runs",
     )
     parser.add_argument(
         "--rescore",

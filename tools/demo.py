@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from gsmap.datasets.annotations.record import CLASSES
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, EachOnce, run_command
 from gsmap.utils.errors import WorkError
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
@@ -378,7 +378,12 @@ def main() -> None:
     parser.add_argument("--dir", default="demo", help="folder of all outputs")
     parser.add_argument("--budget", choices=BUDGETS, default="demo", help="how long to train")
     parser.add_argument(
-        "--models", nargs="+", choices=MODELS, default=["GSMap"], help="models to train, in order"
+        "--models",
+        nargs="+",
+        action=EachOnce,
+        choices=MODELS,
+        default=["GSMap"],
+        help="models to train, in order",
     )
     parser.add_argument(
         "--from-scratch", action="store_true", help="also train each model from nothing"

@@ -16,7 +16,7 @@ from gsmap.evaluation.core.match_files import report_shards
 from gsmap.evaluation.core.report import format_table, write_figures
 from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.evaluation.core.results_json import merge_results
-from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.cli import CommandParser, EachOnce, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.shards import ShardFile, find_shards
 from gsmap.utils.words import format_count
@@ -51,7 +51,9 @@ MERGE = {ANNOTATIONS: merge_annotations, RESULTS: merge_results, MATCHES: merge_
 def main(argv: list[str] | None = None) -> str:
     """Join the parts of each file; return a line for each, which `run_command` prints."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("targets", metavar="FILE", type=output_file, nargs="+", help="file to make")
+    parser.add_argument(
+        "targets", metavar="FILE", type=output_file, nargs="+", action=EachOnce, help="file to make"
+    )
     parser.add_argument(
         "--custom-imports",
         nargs="+",

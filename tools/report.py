@@ -84,6 +84,8 @@ def parse_args() -> argparse.Namespace:
         parser.error("--by, --allow-mismatch and --image-width apply to pages: leave them out")
     if is_film and (args.allow_other_split or args.law or args.changes):
         parser.error("--allow-other-split, --law and --changes apply to pages: leave them out")
+    if args.no_images and args.image_width is not None:
+        parser.error("--image-width is for images, and --no-images leaves them out: give one")
     if args.scene and not is_film:
         parser.error(
             "--scene applies to films: give --out NAME.mp4; a page has a field for the scene"

@@ -24,7 +24,7 @@ import numpy as np
 from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.arguments import add_config_options
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, EachOnce, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import lock_folder, read_json, write_text
 from gsmap.utils.progress import Progress
@@ -46,7 +46,7 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("config", help="config, by file or name, or the name of a trained model")
     parser.add_argument("checkpoint", nargs="?", help="not needed with the name of a model")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--kinds", nargs="+", action=EachOnce, choices=KINDS, default=list(KINDS))
     parser.add_argument("--samples", type=int, help="number of samples, evenly spread (all)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the random corruptions")
     parser.add_argument("--out", type=Path, required=True, help="folder of table and plot")
@@ -57,7 +57,6 @@ def parse_args() -> argparse.Namespace:
     )
     add_config_options(parser)  # --cfg-options, --data-root and --image-scale
     args = parser.parse_args()
-    args.kinds = list(dict.fromkeys(args.kinds))  # a kind that is given twice is measured once
     if args.samples is not None and args.samples < 1:
         parser.error(f"--samples must be >= 1, got {args.samples}")
     return args

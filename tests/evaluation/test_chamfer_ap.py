@@ -154,9 +154,10 @@ def test_branch_and_bound_finds_what_brute_force_finds():
 
 
 def test_bad_configuration_is_refused():
-    for classes in ((), "divider", (1, 2)):
-        with pytest.raises(ValueError, match="classes must be names"):
+    for classes in ((), "divider", (1, 2), ("divider", "divider")):
+        with pytest.raises(ValueError, match="classes must be different names"):
             ChamferConfig(classes)
+    assert ChamferConfig(["divider"], (1.0, 0.5, 1.0)).thresholds == (0.5, 1.0)
     assert ChamferConfig(["divider"]).classes == ("divider",)
     with pytest.raises(ValueError, match="> 0 m"):
         ChamferConfig(("divider",), (0.0, 1.0))

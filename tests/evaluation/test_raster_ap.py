@@ -252,7 +252,7 @@ def test_no_sample_at_all_has_no_iou():
 
 def test_bad_configuration_is_refused():
     for classes in ((), "divider"):
-        with pytest.raises(ValueError, match="classes must be names"):
+        with pytest.raises(ValueError, match="classes must be different names"):
             RasterConfig(classes)
     with pytest.raises(ValueError, match="odd"):
         RasterConfig(CLASSES, dilation_px=4)

@@ -45,7 +45,7 @@ infer: VAL --model base.py K --out out.json | base.py cannot be used: FileNotFou
 infer: VAL --model scope.py K --out out.json | scope.py cannot be used: ValueError: 'gsmap::' is not read in _base_; write a path below
 infer: VAL --model bytes.py K --out out.json | bytes.py cannot be used: UnicodeDecodeError
 infer: VAL --model plain.txt K --out out.json | plain.txt cannot be used: OSError: Only py
-infer: VAL --model empty.py K --out out.json | empty.py: a setting is missing:
+infer: VAL --model empty.py K --out out.json | empty.py has no test_dataloader.dataset
 infer: VAL --model C --out out.json | give a checkpoint after
 infer: VAL --model C nowhere.pth --out out.json | There is no checkpoint nowhere.pth
 infer: VAL --model C damaged.pth --out out.json | damaged.pth was not loaded: it is broken
@@ -109,7 +109,7 @@ export: C maptr.pth --out out.onnx | was never trained with parts
 test: C K --eval | Nothing to do
 test: C K --out . | Is a directory
 test: C K --work-dir w --cfg-options test_dataloader.dataset.data_root=nowhere | no annotation file at nowhere
-browse_dataset: empty.py | a setting is missing: train_dataloader
+browse_dataset: empty.py | empty.py has no train_dataloader.dataset
 browse_dataset: C --num 0 | must be >= 1, got 0
 browse_dataset: C --web . | Is a directory
 browse_dataset: C --show-dir plain.txt | File exists: 'plain.txt'

@@ -84,6 +84,8 @@ def test_drives_of_a_place_are_joined_into_one_map(files, tmp_path, capsys):
     command = [str(results), "--ann", str(two_drives), "--out", str(tmp_path / "maps"), "--join"]
     report = main(command)
     assert report.startswith(f"3 drives, {len(samples)} frames")
+    repeated = main([*command, "--scene", "scene", "later", "away", "scene"])
+    assert repeated.startswith(f"3 drives, {len(samples)} frames")
     names = sorted(path.name for path in (tmp_path / "maps").glob("*.geojson"))
     assert names == sorted(f"{samples[row].map_name}.geojson" for row in (0, -1))
     joined = json.loads((tmp_path / "maps" / f"{samples[0].map_name}.geojson").read_text())
@@ -270,6 +272,16 @@ def test_a_prior_of_drives_and_of_their_map_hold_the_street(files, tmp_path, cap
     assert of_both.max() > of_drive.max()
 
 
+@pytest.mark.parametrize("kind", [[], ["--elements"], ["--gaussians"]])
+def test_a_prior_of_an_unknown_place_is_named_after_its_file(kind, files, tmp_path, capsys):
+    results, ann = files
+    samples = [replace(sample, map_name="") for sample in AnnotationFile(ann)]
+    write_annotations(tmp_path / "a.arrow", AnnotationMeta("own", "lidar", "val"), samples)
+    prior = tmp_path / "oslo.prior"
+    main([str(results), "--ann", str(tmp_path / "a.arrow"), "--prior", str(prior), *kind])
+    assert "prior of oslo, " in capsys.readouterr().out
+
+
 def test_a_gaussian_prior_of_the_frames_holds_the_street(files, tmp_path, capsys):
     results, ann = files
     path = tmp_path / "town.gaussians"
@@ -368,6 +380,7 @@ def test_changes_since_an_old_map_are_written(files, tmp_path, capsys):
         (["r.json"], "--out or --prior must name the output"),
         (["r.json", "--prior", "p", "--changes", "a.osm"], "--changes goes to the folder --out"),
         (["r.json", "--out", "b", "--map-classes", "a"], "--map-classes is for"),
+        (["r.json", "--prior", "p", "--gaussians", "--no-gaussians"], "give one of them"),
     ],
 )
 def test_words_that_do_not_belong_together_are_named(options, message, capsys):

@@ -198,7 +198,7 @@ GRID = {"x_range": [-15, 15], "y_range": [-30, 30]}
     ("rules", "message"),
     [
         ({"metrics": []}, "contains no rules of metrics .*at least one"),
-        ({"settings": {"classes": [["a"]]}}, "contains no rules .*classes must be names"),
+        ({"settings": {"classes": [["a"]]}}, "contains no rules .*classes must be different names"),
         ({"settings": []}, "contains no rules of metrics"),
         ({"metrics": ["os"]}, "contains no rules of metrics .*there is no metric"),
         ({"settings": {"classes": ["divider"]}}, "matches in .* do not fit the rules .*shapes"),

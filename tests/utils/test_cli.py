@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from processes import run_python
 
-from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.cli import CommandParser, EachOnce, output_file, run_command
 from gsmap.utils.errors import InputError, InputTypeError, NotFiniteError, WorkError
 from gsmap.utils.files import atomic_write, read_json, read_text, write_text
 from gsmap.utils.parallel import ordered_map
@@ -348,3 +348,10 @@ def test_similar_options_and_choices_are_named(words, message, capsys):
     with pytest.raises(SystemExit, match="2"):
         parser.parse_args(words)
     assert message in capsys.readouterr().err
+
+
+def test_a_word_that_is_given_twice_counts_once():
+    parser = CommandParser()
+    parser.add_argument("--formats", nargs="+", action=EachOnce, default=["png"])
+    assert parser.parse_args([]).formats == ["png"]
+    assert parser.parse_args(["--formats", "osm", "png", "osm"]).formats == ["osm", "png"]

@@ -12,6 +12,7 @@ from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.plausibility import calibration_warnings
+from gsmap.utils.cli import EachOnce
 from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_machine_error
 from gsmap.utils.parallel import ordered_map
@@ -131,7 +132,9 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py check``."""
-    parser.add_argument("annotations", type=Path, nargs="+", help="annotation files (.arrow)")
+    parser.add_argument(
+        "annotations", type=Path, nargs="+", action=EachOnce, help="annotation files (.arrow)"
+    )
     root_help = "also read all images and LiDAR files, whose paths are relative to this folder"
     parser.add_argument("--data-root", type=Path, help=root_help)
     add_workers_option(parser)

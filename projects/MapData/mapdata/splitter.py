@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.utils.cli import output_file
+from gsmap.utils.cli import EachOnce, output_file
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 from mapdata.overlap import Places, read_places, sample_overlap
@@ -119,7 +119,8 @@ def split_scenes(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py split``."""
     add = parser.add_argument
-    add("files", type=Path, nargs="+", help="annotation files with the scenes to split (.arrow)")
+    files_help = "annotation files with the scenes to split (.arrow)"
+    add("files", type=Path, nargs="+", action=EachOnce, help=files_help)
     add("--out", type=output_file, required=True, help="split file to write (.json)")
     add(
         "--min-distance", type=float, default=60.0, metavar="M",

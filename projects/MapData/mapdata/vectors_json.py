@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
-from gsmap.utils.cli import output_file
+from gsmap.utils.cli import EachOnce, output_file
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
 from gsmap.utils.words import format_count
@@ -108,7 +108,9 @@ def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py export``."""
-    parser.add_argument("annotations", type=Path, nargs="+", help="annotation files (.arrow)")
+    parser.add_argument(
+        "annotations", type=Path, nargs="+", action=EachOnce, help="annotation files (.arrow)"
+    )
     parser.add_argument("target", type=output_file, help="JSON file to write")
 
 

@@ -58,7 +58,7 @@ def select_samples(
 
     Args:
         tokens: Tokens of all samples.
-        wanted: Tokens to select from; None selects from all.
+        wanted: Tokens to select from, a repeated one once; None selects from all.
         max_num: Largest number of samples, at least 1; None selects all.
 
     Returns:
@@ -71,7 +71,7 @@ def select_samples(
     if wanted is not None:
         index_by_token = {token: index for index, token in enumerate(tokens)}
         indices = []
-        for token in wanted:  # in the given order
+        for token in dict.fromkeys(wanted):  # in the given order, each once
             if token not in index_by_token:
                 raise InputError(
                     f"No sample has the token {token!r}; there are {len(tokens)} samples."

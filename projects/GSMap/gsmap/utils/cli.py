@@ -34,6 +34,16 @@ CLEAN_UP_S = 5.0  # time in which further signals are ignored
 RESEND_DELAY_S = 0.05  # delay before a lost signal is sent again
 
 
+class EachOnce(argparse.Action):
+    """Action that stores a list of words, each repeated word once, in the order of the words."""
+
+    def __call__(
+        self, parser: object, namespace: argparse.Namespace, values: Any, option: object = None
+    ) -> None:
+        """Store the words in the namespace."""
+        setattr(namespace, self.dest, list(dict.fromkeys(values)))
+
+
 class CommandParser(argparse.ArgumentParser):
     """Argument parser that shows the command as ``gsmap NAME`` or by the name of its script.
 

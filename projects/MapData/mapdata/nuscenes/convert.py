@@ -21,6 +21,7 @@ import shapely
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, UNITED, MapInstance, MapSample
 from gsmap.datasets.errors import explain_errors
+from gsmap.utils.cli import EachOnce
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from gsmap.utils.parallel import ordered_map
@@ -426,7 +427,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--root", type=Path, required=True, help="data root with maps, samples, v1.0-...")
     add(
-        "--version", nargs="+", default=["v1.0-trainval"], metavar="VERSION",
+        "--version", nargs="+", action=EachOnce, default=["v1.0-trainval"], metavar="VERSION",
         help="version folder, or several to join (default: v1.0-trainval)",
     )  # fmt: skip
     add("--dataset", help="name in the files (default: minicity or nuscenes)")

@@ -48,13 +48,13 @@ def checked_thresholds(thresholds: Sequence[float]) -> tuple[float, ...]:
         thresholds: Distances in metres, at least one, each > 0.
 
     Returns:
-        The distances in ascending order, rounded to micrometres.
+        The distances in ascending order, each once, rounded to micrometres.
 
     Raises:
         ValueError: If there is no distance, or a distance is not a finite number > 0.
     """
     try:
-        rounded = sorted(round(float(value), ndigits=6) for value in thresholds)
+        rounded = sorted({round(float(value), ndigits=6) for value in thresholds})
     except (TypeError, ValueError):
         rounded = []  # reported by the next check
     if not (rounded and all(0 < value < math.inf for value in rounded)):  # false for NaN, too

@@ -115,13 +115,13 @@ def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
     """Return names of classes as a tuple.
 
     Raises:
-        ValueError: If there is no name, or one text in place of several names.
+        ValueError: If there is no name, one text in place of several names, or two equal names.
     """
     names = tuple(classes)
     are_texts = all(isinstance(name, str) for name in names)
-    if isinstance(classes, str) or not names or not are_texts:
+    if isinstance(classes, str) or not names or not are_texts or len(set(names)) < len(names):
         raise InputError(
-            f"classes must be names, such as ('divider', 'boundary'), got {classes!r}."
+            f"classes must be different names, such as ('divider', 'boundary'), got {classes!r}."
         )
     return names
 
