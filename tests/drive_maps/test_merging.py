@@ -7,6 +7,8 @@ from drive_cases import CLASSES, X_RANGE, Y_RANGE, drive_of, street
 
 from drivemaps import line_matching
 from drivemaps.area_merging import merge_areas
+from drivemaps.change import Pass
+from drivemaps.changes import find_changes
 from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, DriveFrame
 from drivemaps.merging import confident, merge, suppress
@@ -62,11 +64,11 @@ def test_an_area_of_exactly_the_smallest_size_is_kept():
         assert len(merge_areas(drive, 1, MergeConfig(min_area_confidence=0.0))) == kept
 
 
-def one_frame_of(rings, scores):
-    """A frame at the origin with crossings."""
+def still_drive(lines, label, scores, num_frames=1):
+    """Frames at the origin, each with elements of one class."""
     sample = replace(drive_of().frames[0].sample, global_from_frame=np.eye(4))
-    elements = MapElements.from_polylines(rings, [1] * len(rings), scores)
-    return replace(drive_of(), frames=[DriveFrame(sample, elements)])
+    elements = MapElements.from_polylines(lines, [label] * len(lines), scores)
+    return replace(drive_of(), frames=[DriveFrame(sample, elements)] * num_frames)
 
 
 @pytest.mark.parametrize("y", [0.0, -7.0])  # -7: over the vehicle
@@ -74,7 +76,7 @@ def one_frame_of(rings, scores):
 def test_a_crossing_with_an_edge_that_runs_back_is_merged_without_the_edge(first, area_m2, y):
     """A square and a bow of two triangles, with an edge of 2 m there and back."""
     ring = np.array([*first, [2, 9], [2, 11], [2, 9], [-2, 9], first[0]])
-    found = merge(one_frame_of([np.add(ring, [0, y])], [0.9]))
+    found = merge(still_drive([np.add(ring, [0, y])], 1, [0.9]))
     assert sum(shapely.Polygon(line).area for line in found.polylines) == pytest.approx(area_m2)
     assert found.scores.tolist() == pytest.approx([0.9] * len(found))
 
@@ -152,6 +154,22 @@ def test_no_predictions_make_an_empty_map_that_can_be_scored():
     figures = map_figures([merge(drive)], [true_map(drive_of())], [drive])
     assert figures["AP"]["mean"] == figures["completeness@1.5"]["mean"] == 0.0
     assert np.isnan(figures["accuracy@1.5"]["mean"])
+
+
+@pytest.mark.filterwarnings("error")  # of a division by 0
+@pytest.mark.parametrize("label", [0, 1])
+@pytest.mark.parametrize("scores", [[0.0], [0.0, 0.9]])
+def test_predictions_with_a_score_of_0_have_no_weight(label, scores):
+    """A line or crossing that is surely not there, and one 6 m beside it."""
+    ring = np.array([[-2.0, -2], [2, -2], [2, 2], [-2, 2], [-2, -2]])
+    shape = ring if label == 1 else np.array([[0.0, -10], [0, 10]])
+    shapes = [shape, np.add(shape, [6, 0])][: len(scores)]
+    drive = still_drive(shapes, label, scores, num_frames=6)
+    found = merge(drive, MergeConfig(min_confidence=0.0, min_area_confidence=0.0))
+    assert found.scores.tolist() == pytest.approx(scores[1:])
+    old = MapElements.from_polylines([np.add(shape, [1, 0])], [label])
+    map_of_shape = MapElements.from_polylines([shape], [label], [0.9])
+    assert find_changes(old, [Pass(drive, map_of_shape)]).changes == []
 
 
 def test_suppression_keeps_the_best_of_what_overlaps():

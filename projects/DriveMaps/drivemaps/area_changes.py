@@ -248,7 +248,7 @@ def _detections(passes: list[Pass], label: int, config: MergeConfig) -> list[_De
             areas = []
             scores = []
             variances = []
-            for index in np.flatnonzero(elements.labels == label).tolist():
+            for index in frame.predictions_of(label).tolist():
                 vertices = slice(elements.offsets[index], elements.offsets[index + 1])
                 # The ring gives one multipolygon, or none if its area is tiny. The parts of a ring
                 # that crosses itself are not separated as in `_polygons`, because only overlaps and

@@ -43,7 +43,7 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     for frame_index, frame in enumerate(drive.frames):
         elements = frame.elements
         variances = config.variances(frame)  # of each vertex across its outline, in square metres
-        for index in np.flatnonzero(elements.labels == label).tolist():
+        for index in frame.predictions_of(label).tolist():
             vertices = slice(elements.offsets[index], elements.offsets[index + 1])
             # A ring that encloses less than MIN_AREA_M2 has no polygon and is left out.
             for area in polygons_of([elements.points[vertices]]):

@@ -52,6 +52,18 @@ class DriveFrame:
         """Angle of ``rotation`` in radians, anticlockwise."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
 
+    def predictions_of(self, label: int) -> IntArray:
+        """Find the predictions of a class. Those with a score of 0 have no weight and are left out.
+
+        Args:
+            label: Index of the class.
+
+        Returns:
+            Indices of the elements. (n,)
+        """
+        elements = self.elements
+        return np.flatnonzero((elements.labels == label) & (elements.confidence > 0.0))
+
     def to_global(self, points: FloatArray) -> FloatArray:
         """Transform points from the annotation frame to the global frame, in the plane.
 

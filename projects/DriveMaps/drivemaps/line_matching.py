@@ -118,7 +118,7 @@ def dense_predictions(drive: Drive, label: int, config: MergeConfig) -> DenseLin
     for frame_index, frame in enumerate(drive.frames):
         elements = frame.elements
         vertex_variances = config.variances(frame)  # across the line, for all vertices of a frame
-        for index in np.flatnonzero(elements.labels == label).tolist():
+        for index in frame.predictions_of(label).tolist():
             vertices = slice(elements.offsets[index], elements.offsets[index + 1])
             line = elements.points[vertices]
             along = arc_lengths(line)

@@ -39,7 +39,8 @@ def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
     """Merge the predictions of all frames into one map, deterministically.
 
     A model may predict an object of a frame several times. Therefore a line is left out if it runs
-    along a line of its frame and class that has a higher score, as in `suppress`.
+    along a line of its frame and class that has a higher score, as in `suppress`. Predictions with
+    a score of 0 are left out, too.
 
     Args:
         drive: Frames with their predictions.
