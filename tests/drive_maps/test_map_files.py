@@ -15,6 +15,7 @@ from drivemaps.lanelet2 import write_lanelet2
 from drivemaps.map_files import read_map
 from drivemaps.map_reading import ClassRule, describe_unused
 from drivemaps.truth import true_map
+from gsmap.structures.elements import MapElements
 
 ORIGIN = MapOrigin(48.26, 11.67)
 GRID = (
@@ -50,6 +51,22 @@ def test_maps_of_the_library_are_read_back(tmp_path, suffix, origin, atol):
     found, _ = read_map(path, CLASSES, origin)
     kept = scored.scores if suffix == "geojson" else np.ones(len(expected))
     np.testing.assert_allclose(found.scores, kept, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "grid", "zone"),
+    [("geojson", "", 39), ("geojson", "EPSG:4527", 39), ("osm", "EPSG:28418", 18)],
+)
+def test_maps_on_grids_whose_eastings_begin_with_the_zone_are_read_back(
+    tmp_path, suffix, grid, zone
+):
+    place = MapGrid(grid) if grid else None  # without it, metres are written
+    line = np.array([[512_000.0, 5.5e6], [512_020.5, 5_500_001.25]]) + np.array([zone * 1e6, 0])
+    path = tmp_path / f"map.{suffix}"
+    write = write_geojson if suffix == "geojson" else write_lanelet2
+    write(path, MapElements.from_polylines([line], [0]), CLASSES, place)
+    found, _ = read_map(path, CLASSES, place)
+    np.testing.assert_allclose(found.points, line, atol=2e-3)
 
 
 @pytest.mark.parametrize("place", [ORIGIN, MapOrigin(40.44, -80.0, utm_zone=17), GRID])

@@ -195,6 +195,12 @@ def test_options_that_do_not_fit_are_refused(words, message, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_changes_on_a_grid_whose_eastings_begin_with_the_zone_are_read(tmp_path):
+    points = [[39_512_000.0, 4_400_000.0], [39_512_009.0, 4_400_000.0]]
+    (change,) = read_changes(written(tmp_path / "f.geojson", feature("added", "divider", points)))
+    assert change.points.tolist() == points
+
+
 LINE = {"type": "LineString", "coordinates": [[0, 0], [0, 9]]}
 GOOD = {"type": "Feature", "properties": {"change": "added", "class": "divider"}, "geometry": LINE}
 
@@ -229,7 +235,7 @@ def line_of(*points: object) -> dict:
         (altered(line_of([0, 0])), "no list of two or more positions"),
         (altered(line_of([0, 0], 3)), "a position has fewer than two coordinates"),
         (altered(line_of([0, 0], [1])), "a position has fewer than two coordinates"),
-        (altered(line_of([0, 0], [1, float("inf")])), "coordinates must be metres within 1e[+]07"),
+        (altered(line_of([0, 0], [1, float("inf")])), "coordinates must be metres within 1e[+]08"),
         (altered(line_of([0, 0], [1, 10**400])), "coordinates must be metres"),
         (altered(line_of([0, 0], [1, "2"])), "coordinates must be metres"),
         (altered(line_of([0, 0], [1, 5e6])), "the changes are longer than 1000 km"),

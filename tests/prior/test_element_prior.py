@@ -118,7 +118,7 @@ def scored(score):
     [
         (MapElements.from_polylines([SQUARE], [3]), r"labels of elements must be in \[0, 3\)"),
         (MapElements.from_polylines([SQUARE[:1]], [0]), "need two vertices or more"),
-        (MapElements.from_polylines([SQUARE * 1e7], [0]), "must be within 1e"),
+        (MapElements.from_polylines([SQUARE * 1e8], [0]), "must be within 1e"),
         (replace(scored(0.5), points=SQUARE * np.nan), "must be within 1e"),
         (scored(7.0), r"scores of elements must be in \[0, 1\]"),
         (scored(np.nan), r"scores of elements must be in \[0, 1\]"),

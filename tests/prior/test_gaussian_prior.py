@@ -254,7 +254,7 @@ def test_threads_write_as_one_after_another():
         (lambda: {"visible": np.ones((3, 3), dtype=np.bool_)}, "visible must be bool of shape"),
         (lambda: {"visible": np.ones((200, 100))}, "visible must be bool of shape"),
         (lambda: {"pose": torch.zeros(4, 4)}, "pose must be a rigid transform"),
-        (lambda: {"pose": pose_at(1e8)}, r"pose is 1e\+08 m from the origin"),
+        (lambda: {"pose": pose_at(1e9)}, r"pose is 1e\+09 m from the origin"),
     ],
 )
 def test_wrong_frames_are_refused(change, message):

@@ -246,6 +246,15 @@ def test_wrong_poses_are_refused(pose, message):
     assert prior.num_tiles == 0
 
 
+def test_tiles_whose_number_is_too_large_for_a_file_are_refused(tmp_path):
+    prior = MapPrior(PriorSettings(("divider",), "town", cell_m=0.01, tile_m=0.01))
+    grid = BEVGrid((-0.1, 0.1), (-0.1, 0.1), 2, 2)
+    prior.write(pose_at(39_512_000, 0), grid, torch.ones(1, 2, 2))
+    with pytest.raises(ValueError, match=r"tiles of 0.01 m are too small for this map"):
+        prior.save(tmp_path / "town.prior")
+    assert not (tmp_path / "town.prior").exists()
+
+
 @pytest.mark.parametrize(
     ("values", "visible", "message"),
     [

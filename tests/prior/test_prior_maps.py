@@ -20,7 +20,7 @@ def pose_at(x, y):
     return pose
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (-3000.0, 600.0), (999_900.0, -999_900.0)])
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (-3000.0, 600.0), (39_512_400.0, -999_900.0)])
 def test_cells_near_a_line_and_within_an_area_are_hits(shift):
     """A line over four tiles, and a crossing over the border of two."""
     line = np.array([[-70.0, -20.0], [10.0, 7.0], [33.0, 50.0]])

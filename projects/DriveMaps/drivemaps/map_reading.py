@@ -17,13 +17,11 @@ import shapely
 
 from drivemaps.geodetic import MapGrid, MapOrigin
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.elements import FARTHEST_M, FloatArray, MapElements
 from gsmap.utils.errors import InputError
 
 CLASS_KEY = "class"
 """Property with the class of an element in the files of `write_geojson` and `write_lanelet2`."""
-FARTHEST_M = 1e7
-"""Largest coordinate of a vertex in metres of the global frame."""
 _MOST_VERTICES = 5_000_000  # limits the memory that an untrusted file can take
 _SMALLEST_M2 = 0.01  # a ring with a smaller area is a point or a line and is not used
 _LONGEST_NAME = 60  # largest number of characters of a value in a message

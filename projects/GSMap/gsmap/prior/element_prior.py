@@ -16,7 +16,6 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.prior.element_rule import ElementRule
 from gsmap.prior.file_format import (
     ELEMENT_MAGIC,
-    FARTHEST_TILE,
     TileKey,
     read_file,
     save_file,
@@ -26,7 +25,7 @@ from gsmap.prior.inputs import Pose, planar_pose
 from gsmap.prior.settings import PriorSettings
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.cutting import cut_to_range
-from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.elements import FARTHEST_M, FloatArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed, pad_lines
 from gsmap.utils.errors import InputError
@@ -35,7 +34,6 @@ _MOST_ELEMENTS = 1_000_000
 _MOST_VERTICES = 4_000_000  # of all elements together
 # Limit for areas whose outline crosses itself: each crossing makes the repair slower.
 _MOST_VERTICES_OF_CROSSED_AREA = 50
-_FARTHEST_M = 1e7  # largest coordinate of a vertex
 # A tile in a file consists of its counts and, compressed, its stored elements and their vertices.
 _COUNTS = np.dtype([("elements", "<u4"), ("vertices", "<u4")])
 _STORED = np.dtype([("label", "<u2"), ("score", "<f4"), ("num_vertices", "<u4")])
@@ -93,9 +91,9 @@ class ElementPrior:
         flat = elements.with_coordinates(2)
         if len(flat.points) > _MOST_VERTICES:
             raise InputError(f"a prior has at most {_MOST_VERTICES} vertices: split the map.")
-        is_near = np.abs(flat.points) <= _FARTHEST_M  # False for NaN
+        is_near = np.abs(flat.points) <= FARTHEST_M  # False for NaN
         if not is_near.all():
-            raise InputError(f"vertices must be within {_FARTHEST_M:g} m of the origin.")
+            raise InputError(f"vertices must be within {FARTHEST_M:g} m of the origin.")
         confidence = flat.confidence
         if not ((confidence >= 0) & (confidence <= 1)).all():
             raise InputError("scores of elements must be in [0, 1].")
@@ -234,8 +232,6 @@ class ElementPrior:
         rows_of_tile: dict[TileKey, list[int]] = defaultdict(list)
         first_vertices = self.elements.points[self.elements.offsets[:-1]]
         tiles = np.floor(first_vertices / self.settings.tile_m).astype(np.int64)
-        if np.abs(tiles).max(initial=0) > FARTHEST_TILE:
-            raise InputError(f"tiles of {self.settings.tile_m:g} m are too small for this map.")
         # `row` is the index of an element; `column` and `tile_row` are the position of a tile.
         for row, (column, tile_row) in enumerate(tiles.tolist()):
             rows_of_tile[column, tile_row].append(row)

@@ -139,6 +139,9 @@ def write_tiles(
         rule: Rule that computes the stored states.
         tiles: Column and row, and compressed states, of each tile.
         magic: First bytes of the kind of file.
+
+    Raises:
+        ValueError: If a column or row is too large for the index.
     """
     rule_entry = rule_settings(rule, _KINDS[magic].rules)  # name and numbers of the rule
     header = json.dumps(asdict(settings) | {"rule": rule_entry}).encode()
@@ -147,6 +150,8 @@ def write_tiles(
     offset = _START.size + len(header)
     rows = []
     for (column, row), content in tiles:
+        if max(abs(column), abs(row)) > FARTHEST_TILE:
+            raise InputError(f"tiles of {settings.tile_m:g} m are too small for this map.")
         file.write(content)
         rows.append((column, row, offset, len(content), zlib.crc32(content)))
         offset += len(content)

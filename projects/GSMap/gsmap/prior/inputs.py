@@ -8,13 +8,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsmap.structures.elements import FARTHEST_M
 from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import lock_file
 
 Pose = Tensor | NDArray[np.floating[Any]]
 Raster = Tensor | NDArray[Any]
-_FARTHEST_M = 1e7  # largest x or y of a pose, in metres
 
 
 class PlanarPose(NamedTuple):
@@ -50,17 +50,17 @@ def planar_pose(pose: Pose) -> PlanarPose:
         pose: Transform from a frame to the global frame, in metres. (4, 4)
 
     Raises:
-        ValueError: If the pose is not rigid, its x or y is beyond 1e7 m, or it has no yaw because
-            the x axis of the frame is vertical.
+        ValueError: If the pose is not rigid, its x or y is beyond ``FARTHEST_M``, or it has no yaw
+            because the x axis of the frame is vertical.
     """
     transform = to_numpy(pose).astype(np.float64, copy=False)
     if transform.shape != (4, 4) or not is_rigid(transform):
         raise InputError("pose must be a rigid transform of shape (4, 4).")
     largest_coordinate_m = np.abs(transform[:2, 3]).max()
-    if largest_coordinate_m > _FARTHEST_M:
+    if largest_coordinate_m > FARTHEST_M:
         raise InputError(
             f"pose is {largest_coordinate_m:.3g} m from the origin; at most "
-            f"{_FARTHEST_M:g} m are possible."
+            f"{FARTHEST_M:g} m are possible."
         )
     axis = transform[:2, 0]  # x axis of the frame, projected to the plane
     length = float(np.hypot(axis[0], axis[1]))

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsmap.prior.file_format import FARTHEST_TILE, read_header, write_tiles
+from gsmap.prior.file_format import read_header, write_tiles
 from gsmap.prior.inputs import Pose, Raster, planar_pose, reserve_file, to_numpy
 from gsmap.prior.rules import HitMissCounts, States, WriteRule
 from gsmap.prior.settings import PriorSettings
@@ -321,10 +321,6 @@ class MapPrior:
         width = int(columns.max()) - first_column + 1
         height = int(rows.max()) - first_row + 1
         cells = (rows - first_row) * width + (columns - first_column)
-        # `planar_pose` limits the position, and the check above limits the extent of the grid. So
-        # the columns and rows of tiles fit into the integers in the index of a file.
-        farthest = max(abs(first_column), abs(first_row)) + max(width, height)
-        assert farthest < FARTHEST_TILE * self.settings.tile_cells
         return _Window(
             first_column=first_column,
             first_row=first_row,

@@ -16,14 +16,13 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.prior.file_format import TileKey
 from gsmap.prior.settings import PriorSettings
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.elements import FARTHEST_M, FloatArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed
 from gsmap.utils.errors import InputError
 
 _MOST_PIECES = 1_000_000  # largest number of pieces of lines and areas, in all tiles together
 _CHUNK = 64  # pieces of a tile that are drawn at a time, which bounds the memory
-_FARTHEST_M = 1e7  # largest coordinate of a vertex
 Piece = tuple[int, bool, FloatArray]
 """Class index, whether the piece is a filled area, and vertices in metres (n, 2)."""
 
@@ -52,8 +51,8 @@ def covered_cells(
     is_unknown = (elements.labels < 0) | (elements.labels >= num_classes)
     if is_unknown.any():
         raise InputError(f"labels of elements must be in [0, {num_classes}), the prior's classes.")
-    if np.abs(elements.points[:, :2]).max(initial=0.0) > _FARTHEST_M:
-        raise InputError(f"vertices must be within {_FARTHEST_M:g} m of the origin.")
+    if np.abs(elements.points[:, :2]).max(initial=0.0) > FARTHEST_M:
+        raise InputError(f"vertices must be within {FARTHEST_M:g} m of the origin.")
     pieces_of_tile = _pieces_by_tile(elements, settings=settings, width_m=width_m)
     side = settings.tile_cells
     extent = (0.0, settings.tile_m)

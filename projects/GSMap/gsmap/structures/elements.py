@@ -35,6 +35,11 @@ def ground_truth_elements(results: Mapping[str, Any], transform: object) -> Sequ
     return elements
 
 
+FARTHEST_M = 1e8
+"""Largest coordinate of a pose or a point in the global frame, in metres.
+
+Grids whose eastings begin with the number of a zone, such as EPSG:4527, reach 6e7 m.
+"""
 MAX_LENGTH_M = 1e5
 """Largest distance in metres of a point of a map from the vehicle, and largest length of a line."""
 MAX_TOTAL_LENGTH_M = 1e6

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.annotations.schema import matrices_of
 from gsmap.structures.calibration import NUM_CAN_BUS
-from gsmap.structures.elements import MAX_LENGTH_M
+from gsmap.structures.elements import FARTHEST_M, MAX_LENGTH_M
 from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
 
@@ -121,7 +121,7 @@ def _are_pinholes(arrays: pa.FixedSizeListArray, *_: object) -> np.ndarray:
 def _are_transforms(arrays: pa.FixedSizeListArray, *_: object) -> np.ndarray:
     """Test which matrices are rigid transforms with a translation within the limit."""
     matrices = matrices_of(arrays, (4, 4))
-    are_near = (np.abs(matrices[:, :3, 3]) <= _MAX_TRANSLATION_M).all(-1)
+    are_near = (np.abs(matrices[:, :3, 3]) <= FARTHEST_M).all(-1)
     return is_rigid(matrices) & are_near
 
 
@@ -175,7 +175,6 @@ def _are_polylines(lists: pa.ListArray, _: np.ndarray, meta: AnnotationMeta) -> 
     return are_good
 
 
-_MAX_TRANSLATION_M = 1e8  # 2.5 times the circumference of the Earth
 # Entries of `_RULES` that several fields share: a test and a message.
 _TRANSFORM = (
     _are_transforms,

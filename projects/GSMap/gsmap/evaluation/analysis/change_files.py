@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.structures.elements import FloatArray
+from gsmap.structures.elements import FARTHEST_M, FloatArray
 from gsmap.structures.polylines import arc_lengths, points_at_steps
 from gsmap.utils.errors import InputError
 from gsmap.utils.json_items import items_of
@@ -17,7 +17,6 @@ KINDS = ("removed", "added", "moved")
 STEP_M = 0.5
 """Distance in metres of the points at which changes are compared."""
 # Limits of the values of a file, which may be untrusted.
-_FARTHEST_M = 1e7  # largest coordinate
 _LONGEST_M = 1e6  # largest sum of the lengths of all changes of a file
 _LONGEST_NAME = 80  # letters
 # Value of a key that the file does not contain. It cannot be None, which is the value of a present
@@ -185,7 +184,7 @@ def _read_points(positions: Any) -> FloatArray:
             raise InputError("a position has fewer than two coordinates")
         if not _is_in_range(position[0]) or not _is_in_range(position[1]):
             raise InputError(
-                f"coordinates must be metres within {_FARTHEST_M:g} m, got {position!r:.60}"
+                f"coordinates must be metres within {FARTHEST_M:g} m, got {position!r:.60}"
             )
         points.append((float(position[0]), float(position[1])))
     return np.array(points, dtype=np.float64)
@@ -197,5 +196,5 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_in_range(value: Any) -> bool:
-    """Whether a value is a finite number between -1e7 and 1e7."""
-    return _is_number(value) and abs(value) <= _FARTHEST_M  # false for NaN
+    """Whether a value is a number within ``FARTHEST_M``, so finite."""
+    return _is_number(value) and abs(value) <= FARTHEST_M  # false for NaN
