@@ -314,6 +314,17 @@ def test_nodes_without_local_positions_need_an_origin(tmp_path):
     np.testing.assert_allclose(found.points, [[0, 0], [14.85, 0]], atol=0.01)
 
 
+@pytest.mark.parametrize("place", [MapOrigin(48.261, 11.67), GRID])
+def test_local_positions_that_contradict_the_origin_are_refused(tmp_path, place):
+    path = tmp_path / "town.osm"
+    path.write_text(osm(way(10, [1, 2], type="line_thin")))
+    for origin in (None, ORIGIN):  # as the positions
+        found, _ = read_map(path, CLASSES, origin)
+        assert found.points.tolist() == [[0, 0], [0, 11]]
+    with pytest.raises(ValueError, match=r"local_y of a node lie \d+ m from its lat"):
+        read_map(path, CLASSES, place)
+
+
 LAUGHS = "".join(f"<!ENTITY l{i} '{f'&l{i - 1};' * 10}'>" for i in range(1, 10))
 HOSTILE_OSM = {
     "nothing": ("", "is no valid XML .no element found"),

@@ -34,6 +34,7 @@ _MOST_PARTS = 10_000_000  # largest number of parts: nodes, ways, relations, and
 # Largest number of nodes of all crosswalk rings together, as a multiple of the parts of the file.
 # Without this limit, the crosswalks of a small file could repeat one long line any number of times.
 _MOST_USES = 4
+_MOST_APART_M = 10.0  # largest distance between the local position of a node and its degrees
 _KINDS = ("node", "way", "relation")
 
 
@@ -93,13 +94,14 @@ def read_lanelet2(
     A line string gets its class from the tag ``class``, or else from its type (`CLASS_OF_TYPE`). A
     lanelet of the subtype ``crosswalk`` is an area of the class ``ped_crossing``. Positions are
     ``local_x`` and ``local_y`` if all used nodes have them, and otherwise longitude and latitude.
-    Other line strings and relations are only counted.
+    Both must agree with the origin, if nodes have both and there is one. Other line strings and
+    relations are only counted.
 
     Args:
         path: File, which may be untrusted. A file with a document type declaration is refused,
             because it could declare XML entities that expand to a very long text.
         classes: Class names in label order.
-        origin: Position of the global frame on the Earth, for nodes without local positions.
+        origin: Position of the global frame on the Earth, to convert or to check positions.
         rule: Tag that gives a line string its class. Types and crosswalks are then not used.
 
     Returns:
@@ -108,9 +110,9 @@ def read_lanelet2(
     Raises:
         FileNotFoundError: If the file does not exist.
         ValueError: If the file is malformed or too large, a number is not finite or out of range,
-            a node or a bound of a crosswalk is missing, degrees have no origin, or no element can
-            be used.
-        RuntimeError: If nodes have degrees only and ``pyproj`` is missing.
+            a node or a bound of a crosswalk is missing, degrees have no origin or contradict local
+            positions, or no element can be used.
+        RuntimeError: If an origin is given and ``pyproj`` is missing.
     """
     path = Path(path)
     parser = _Parser(path)
@@ -143,6 +145,8 @@ def read_lanelet2(
             f"{path} has nodes without local_x and local_y, and the origin of the global frame is "
             "not known: give --origin or --crs."
         )
+    if is_local and origin is not None:
+        parser.require_origin(origin, [nodes for _, nodes in lines])
     for class_name, nodes in lines:
         collector.add(class_name, parser.positions(nodes, is_local=is_local))
     # With the origin, `finish` converts degrees to metres. Without it, lines are in metres already.
@@ -327,6 +331,33 @@ class _Parser:
                 if node.local is None:
                     return False
         return True
+
+    def require_origin(self, origin: MapOrigin | MapGrid, lines: Sequence[Sequence[str]]) -> None:
+        """Check that local positions are metres from an origin.
+
+        The first node with degrees is checked. Nodes of Autoware have positions in a square of the
+        military grid, which is another frame.
+
+        Args:
+            origin: Position of the global frame on the Earth.
+            lines: IDs of the nodes of each line. All nodes have local positions.
+
+        Raises:
+            ValueError: If a node is farther than 10 m from its longitude and latitude.
+        """
+        for references in lines:
+            for node in self._nodes(references):
+                if node.degrees is None or node.local is None:
+                    continue
+                (point,) = origin.points_of(np.array([node.degrees]), where=str(self._path))
+                distance_m = float(np.linalg.norm(point - node.local))
+                if distance_m > _MOST_APART_M:
+                    raise InputError(
+                        f"{self._path}: local_x and local_y of a node lie {distance_m:.0f} m from "
+                        "its lat and lon in the global frame: correct --origin or --crs, leave it "
+                        "out to use local_x and local_y, or remove these tags to use lat and lon."
+                    )
+                return
 
     def positions(self, references: Sequence[str], is_local: bool) -> FloatArray:
         """Return the positions of nodes.
