@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -34,6 +35,7 @@ from gsmap.apis.export import (
 )
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.apis.onnx_inferencer import OnnxInferencer
+from gsmap.datasets.source import open_annotations
 from gsmap.engine.launch import read_config
 from gsmap.structures.elements import MapElements
 
@@ -149,6 +151,27 @@ def test_the_shipped_model_predicts_as_in_torch(shipped):
     names = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT")
     assert shipped[2].cameras[:3] == names
     assert shipped[2].metadata["score_threshold"] is None
+
+
+def test_cameras_of_other_names_are_assigned_by_direction(shipped, annotations):
+    inferencer, dataset, exported = shipped
+    source = open_annotations(annotations, annotations.parent)
+
+    def inputs_of(cameras):
+        samples = [replace(source.samples[0], cameras=cameras)]
+        renamed = inferencer.dataset(replace(source, samples=samples))
+        ((_, inputs),) = graph_inputs(exported, renamed, [0])
+        return inputs
+
+    cameras = [replace(c, name=f"my_{c.name}") for c in source.samples[0].cameras]
+    ((_, expected),) = graph_inputs(exported, dataset, [0])
+    for order in (cameras, cameras[::-1], cameras[3:] + cameras[:3]):
+        for name, values in inputs_of(order).items():
+            np.testing.assert_array_equal(values, expected[name])
+    twice = [replace(cameras[0], name="twin"), *cameras[1:-1], cameras[0]]
+    for rig in (twice, cameras[1:]):  # two of one direction, and one that is absent
+        with pytest.raises(ValueError, match=r"takes the cameras CAM_FRONT, .*, my_CAM_.*: name"):
+            inputs_of(rig)
 
 
 def test_vehicle_signals_follow_one_rule(shipped):

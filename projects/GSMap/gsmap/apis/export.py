@@ -1,5 +1,6 @@
 """Export of a trained model to one ONNX file that computes elements from images and calibration."""
 
+import copy
 import json
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,6 +23,7 @@ from gsmap.apis.onnx_inferencer import (
     STREAM_INPUTS,
     OnnxInferencer,
 )
+from gsmap.apis.rig_fit import camera_names, camera_rows
 from gsmap.structures.calibration import NUM_CAN_BUS, OF_ONE_FRAME
 from gsmap.structures.elements import MapElements
 from gsmap.structures.past import Past
@@ -411,8 +413,9 @@ def graph_inputs(
 ) -> Iterator[tuple[str, dict[str, NDArray[np.float32]]]]:
     """Yield the inputs of the exported graph for samples of a data set.
 
-    For a model with memory, the samples of a scene form a stream in the order of ``indices``, and
-    the graph is run on each sample to compute its new memory.
+    Cameras are assigned to the cameras of the graph by name, or else by viewing direction
+    (`camera_rows`). For a model with memory, the samples of a scene form a stream in the order of
+    ``indices``, and the graph is run on each sample to compute its new memory.
 
     Args:
         inferencer: The exported graph.
@@ -423,8 +426,9 @@ def graph_inputs(
         Token of a sample, and its inputs by name.
 
     Raises:
-        ValueError: If images or matrices do not fit the cameras of the graph.
+        ValueError: If cameras, images or matrices do not fit the cameras of the graph.
     """
+    dataset = _with_cameras_of(inferencer, dataset)
     streams = inferencer.new_scenes() if inferencer.has_memory else None
     for index in indices:
         packed = dataset[index]
@@ -435,6 +439,26 @@ def graph_inputs(
         if streams is not None:  # the next sample of this scene needs the new memory
             outputs = inferencer.run(inputs)
             inferencer.remember(streams, meta=meta, outputs=outputs)
+
+
+def _with_cameras_of(inferencer: OnnxInferencer, dataset: Any) -> Any:
+    """Copy of a data set whose cameras are in the order of the graph.
+
+    Raises:
+        ValueError: If there is not exactly one camera for each camera of the graph.
+    """
+    names = camera_names(dataset)
+    # For each camera of the data set, the index of the camera of the graph that it stands for.
+    rows = camera_rows(dataset, trained=inferencer.cameras)
+    if sorted(rows) != list(range(len(inferencer.cameras))):
+        raise InputError(
+            f"{inferencer.path.name} takes the cameras {', '.join(inferencer.cameras)}; those of "
+            f"the samples, {', '.join(names)}, are not one for each of them by name or direction: "
+            "name them as the model does, or export for other cameras."
+        )
+    dataset = copy.copy(dataset)  # the caller's data set keeps its cameras
+    dataset.cameras = tuple(names[index] for index in np.argsort(rows))
+    return dataset
 
 
 def largest_differences(

@@ -68,7 +68,7 @@ def camera_rows(dataset: "VectorizedMapDataset", trained: Sequence[str]) -> list
         ValueError: If the names differ, and the viewing directions of the model's cameras are
             unknown.
     """
-    names = _camera_names(dataset)
+    names = camera_names(dataset)
     if set(names) <= set(trained):
         return [list(trained).index(name) for name in names]
     num_samples = min(len(dataset), _MAX_SAMPLES)
@@ -78,8 +78,8 @@ def camera_rows(dataset: "VectorizedMapDataset", trained: Sequence[str]) -> list
     return similar_cameras(fullest_sample, frame=frame, names=names, trained=trained)
 
 
-def _camera_names(dataset: "VectorizedMapDataset") -> Sequence[str]:
-    """Names of the cameras of a data set; by default the cameras of its first sample."""
+def camera_names(dataset: "VectorizedMapDataset") -> Sequence[str]:
+    """Return the names of a data set's cameras; by default the cameras of its first sample."""
     return dataset.cameras or [camera.name for camera in dataset.sample(0).cameras]
 
 
@@ -181,7 +181,7 @@ def _fit_cameras(
         if len(embeds) == num_cameras:  # assume that the cameras are equal
             return []
         trained = ()  # no known names
-    names = _camera_names(dataset)
+    names = camera_names(dataset)
     names_are_known = set(names) <= set(trained)
     directions_are_known = bool(trained) and set(trained) <= AZIMUTHS_DEG.keys()
     if not names_are_known and not directions_are_known:
