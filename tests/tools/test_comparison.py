@@ -12,6 +12,7 @@ import torch
 from comparison.jobs import Job
 from comparison.plan import Protocol, Run, parse_entry, plan
 from comparison.results import (
+    as_json,
     check_one_test_set,
     differences_to_first,
     evaluator_for,
@@ -164,6 +165,32 @@ def test_means_spread_and_paired_differences_by_hand(tmp_path):
     assert any("train ended with exit code -9: train.log" in line for line in lines)
     assert differences_to_first(results)["B"]["raster/mAP"] == pytest.approx([0.1, 0.2])
     assert "`python tools/compare.py`" in lines
+
+
+@pytest.mark.parametrize(
+    ("runs", "expected", "without_pair"),
+    [
+        ("A0 A0 B0", [], "012"),
+        ("A0 B0 B0", [], "012"),
+        ("A? B? B0", [], "012"),
+        ("A0 A0 A1 B0 B1", [0.2], "013"),
+        ("A0 B0 C1", [0.1], "2"),
+        ("A0 A1", [], ""),
+    ],
+)
+def test_only_runs_with_one_partner_are_paired(runs, expected, without_pair, tmp_path):
+    """Run i, which is named by its config and its seed, has an AP of i / 10."""
+    results = []
+    for number, (name, seed) in enumerate(runs.split()):
+        folder = finished(tmp_path / str(number), number / 10, number / 10)
+        results.append(read_result(name, folder, None if seed == "?" else int(seed)))
+    found = differences_to_first(results).get("B", {}).get("raster/mAP", [])
+    assert found == pytest.approx(expected)
+    folders = [str(tmp_path / number) for number in without_pair]
+    assert json.loads(as_json(results, "", ""))["without_pair"] == folders
+    text = markdown(results, "", "")
+    assert ("In no pair" in text) == bool(folders)
+    assert ", ".join(folders) in text
 
 
 def with_config(folder: Path, text: str | None) -> Path:

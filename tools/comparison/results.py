@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -277,30 +278,53 @@ def _cell(values: Sequence[float], factor: float = 1.0, form: str = ".1f") -> st
     return text
 
 
+def pairs_with_first(results: Sequence[Result]) -> list[tuple[Result, Result]]:
+    """Pair the finished runs of each config with the runs of the first config, seed by seed.
+
+    A run is in no pair if its seed is unknown, or if its config has several runs of this seed.
+
+    Returns:
+        A run of the first config and a run of another config in each pair.
+    """
+    done = _finished(results)
+    counts = Counter((result.name, result.seed) for result in done)
+    first_runs: dict[int, Result] = {}  # runs of the first config by seed
+    others: list[Result] = []
+    for result in done:
+        if result.seed is None or counts[result.name, result.seed] > 1:
+            continue
+        if result.name == results[0].name:
+            first_runs[result.seed] = result
+        else:
+            others.append(result)
+    return [(first_runs[run.seed], run) for run in others if run.seed in first_runs]
+
+
 def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[float]]]:
     """Differences of the figures between each config and the first one, seed by seed.
 
     Returns:
         Differences by name of the config, then by key of the figure, in one list with an entry for
-        each seed that both configs have.
+        each pair of `pairs_with_first`.
     """
-    done = _finished(results)
-    if not done:
-        return {}
-    first_name = results[0].name
-    first_figures = {}  # figures of the first config by seed
-    for result in done:
-        if result.name == first_name:
-            first_figures[result.seed] = result.figures
     differences: dict[str, dict[str, list[float]]] = {}
-    for result in done:
-        if result.name == first_name or result.seed not in first_figures:
-            continue
+    for first, result in pairs_with_first(results):
         by_figure = differences.setdefault(result.name, {})
         for key in _columns(results):
-            difference = result.figures[key] - first_figures[result.seed][key]
+            difference = result.figures[key] - first.figures[key]
             by_figure.setdefault(key, []).append(difference)
     return differences
+
+
+def folders_without_pair(results: Sequence[Result]) -> list[str]:
+    """Folders of the finished runs in no pair of `pairs_with_first`, if there are two configs."""
+    done = _finished(results)
+    if len({result.name for result in done}) < 2:
+        return []
+    paired: set[Path] = set()
+    for first, result in pairs_with_first(results):
+        paired |= {first.folder, result.folder}
+    return [str(result.folder) for result in done if result.folder not in paired]
 
 
 def markdown(results: Sequence[Result], title: str, command: str) -> str:
@@ -348,6 +372,12 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
     if difference_rows:
         parts.append(f"Differences to {names[0]}, seed by seed.")
         parts.append(markdown_table(["config", "pairs", *heads], difference_rows))
+    without_pair = folders_without_pair(results)
+    if without_pair:
+        parts.append(
+            "In no pair, as the seed is unknown, of several runs of the config, or of no run of "
+            f"the other: {', '.join(without_pair)}."
+        )
     parts += [
         "Cost. Peak memory is the largest process's, or the GPU's.",
         markdown_table(["config", *_COSTS], cost_rows),
@@ -391,6 +421,7 @@ def as_json(results: Sequence[Result], title: str, command: str) -> str:
         "title": title,
         "command": command,
         "differences": differences_to_first(results),
+        "without_pair": folders_without_pair(results),
         "runs": runs,
     }
     return json.dumps(content, indent=1)
