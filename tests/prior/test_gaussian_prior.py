@@ -299,6 +299,28 @@ def test_a_file_holds_everything(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [".town.gaussians.lock", "town.gaussians"]
 
 
+def test_what_is_saved_can_be_loaded(tmp_path, monkeypatch):
+    """A vertex a rounding before the edge of a tile, a wide line, and a crowded tile."""
+    path = tmp_path / "town.gaussians"
+    settings = PriorSettings(("divider",), "town", cell_m=0.1, tile_m=0.7)
+    edges = 0.7 * np.arange(1, 40)
+    before = np.nextafter(edges, -np.inf)
+    assert (np.floor(before / 0.7) * 0.7 > before).any()  # the quotient is rounded up
+    prior = GaussianPrior(settings)
+    for x in before:
+        prior.write(pose_at(), GRID, line_at(x))
+    prior.save(path)
+    assert GaussianPrior.load(path).num_gaussians == prior.num_gaussians > 100
+    prior = GaussianPrior(SETTINGS)
+    prior.write(pose_at(), GRID, line_at(0.0, sigma_m=200.0))
+    prior.save(path)
+    _, found, _ = GaussianPrior.load(path).gaussians(0)
+    assert found[:, 0, 0] == pytest.approx(1e4)
+    monkeypatch.setattr("gsmap.prior.gaussian_prior._MOST_PER_TILE", 2)
+    with pytest.raises(ValueError, match=r"a tile has 6 .*, and 2 are possible.* below 60 m"):
+        prior.save(path)
+
+
 def test_files_of_other_settings_and_kinds_are_refused(tmp_path):
     path = tmp_path / "town.gaussians"
     filled().save(path)

@@ -290,6 +290,14 @@ def test_the_good_file_is_read(tmp_path):
     assert MapPrior.load(path).read(pose_at(30), GRID).shape == (1, 40, 20)
 
 
+def test_a_file_may_have_as_many_and_as_long_names_as_its_prior(tmp_path):
+    """A letter outside of Unicode's first plane has 12 bytes in the header."""
+    names = [f"{number:03d}" + 197 * "\U0001f6e3" for number in range(65)]
+    settings = PriorSettings(tuple(names[:64]), names[64])
+    MapPrior(settings).save(tmp_path / "long.prior")
+    assert MapPrior.load(tmp_path / "long.prior").settings == settings
+
+
 def test_a_missing_file_is_an_error_of_the_system(tmp_path):
     with pytest.raises(FileNotFoundError):
         MapPrior.load(tmp_path / "none")

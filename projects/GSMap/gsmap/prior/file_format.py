@@ -47,7 +47,7 @@ _FOOTER = struct.Struct("<QIII8s")
 _INDEX = np.dtype(
     [("column", "<i4"), ("row", "<i4"), ("offset", "<u8"), ("length", "<u4"), ("crc", "<u4")]
 )
-_LONGEST_HEADER = 1 << 16  # in bytes
+_LONGEST_HEADER = 1 << 18  # in bytes; 65 names of 200 letters have at most 12 bytes a letter
 
 
 class _Kind(NamedTuple):

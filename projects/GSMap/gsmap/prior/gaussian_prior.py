@@ -52,7 +52,7 @@ _COUNT_BYTES = 4  # a tile in a file begins with the number of its Gaussians, in
 # are at least the second one.
 _FORGOTTEN_VALUE = 0.1
 _FORGOTTEN_VIEWS = 3.0
-_LARGEST_VARIANCE = 1e4  # of a Gaussian in a file, in square metres
+_LARGEST_VARIANCE = 1e4  # of a stored Gaussian, in square metres
 _FAR_M = 1e6  # position of padding, which no raster reaches
 
 
@@ -127,9 +127,16 @@ class GaussianPrior:
 
         Raises:
             RuntimeError: If the file is reserved by another process.
-            ValueError: If another program has written the lock file beside it.
+            ValueError: If a tile has more than 100,000 Gaussians, or another program has written
+                the lock file beside it.
         """
         with self._lock:
+            most = max((len(stored) for stored in self._tiles.values()), default=0)
+            if most > _MOST_PER_TILE:
+                raise InputError(
+                    f"{path} cannot be written: a tile has {most} Gaussians, and {_MOST_PER_TILE} "
+                    f"are possible. Build the prior with a tile_m below {self.settings.tile_m:g} m."
+                )
             # The order of the keys makes the files of equal priors equal.
             tiles = [(key, _pack(self._tiles[key])) for key in sorted(self._tiles)]
             save_file(Path(path), self.settings, rule=self.rule, tiles=tiles, magic=GAUSSIAN_MAGIC)
@@ -425,10 +432,11 @@ class _GaussianSet:
         key_indices = key_indices.ravel()
         stored = np.zeros(len(self.labels), _STORED)
         stored["label"] = self.labels
-        stored["position"] = self.means - tile_m * tile_keys
+        # The quotient above is rounded, so a centre may lie outside of its tile by a rounding.
+        stored["position"] = np.clip(self.means - tile_m * tile_keys, 0.0, tile_m)
         # Updates may have moved an angle out of [-pi, pi].
         stored["angle"] = np.arctan2(np.sin(self.angles), np.cos(self.angles))
-        stored["variance"] = self.variances
+        stored["variance"] = np.minimum(self.variances, _LARGEST_VARIANCE)
         stored["hits"] = self.hits
         stored["misses"] = self.misses
         for number, (column, row) in enumerate(keys.tolist()):
