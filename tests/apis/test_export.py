@@ -366,6 +366,22 @@ def small_inputs(exported, count=2):
     return [exported.prepare(each, meta) for each in images]
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_arrays_that_are_not_finite_are_named(small, value):
+    images = np.zeros((6, 64, 96, 3))
+    meta = {"lidar2img": ring_of_cameras(NUM_CAMS, *IMAGE_SHAPE), "can_bus": np.zeros(18)}
+    small.prepare(images, meta)
+    fields = {"img_from_frame": "lidar2img", "can_bus": "can_bus"}
+    for name, field in fields.items():
+        broken = meta[field].copy()
+        broken[5] = value
+        with pytest.raises(ValueError, match=f"^{name} of .* must be finite"):
+            small.prepare(images, {**meta, field: broken})
+    images[1, 2, 3] = value
+    with pytest.raises(ValueError, match=r"^images of .* must be finite"):
+        small.prepare(images, meta)
+
+
 def test_half_precision_and_8_bits_stay_close(small, tmp_path):
     import onnx
 

@@ -187,11 +187,11 @@ class OnnxInferencer:
             The elements, best first, with scores and, if the model predicts them, Gaussians.
 
         Raises:
-            ValueError: If images or matrices do not fit the cameras, or a matrix is missing. For a
-                model with memory, also if there is no stream, if the stream belongs to another
-                model, or if the frame is not later than the last frame of the stream. For a model
-                without memory, also if there is a stream. Also if the graph fails on the inputs, or
-                its outputs are not valid map elements.
+            ValueError: If images or matrices do not fit the cameras, a matrix is missing, or a
+                value is not finite. For a model with memory, also if there is no stream, if the
+                stream belongs to another model, or if the frame is not later than the last frame of
+                the stream. For a model without memory, also if there is a stream. Also if the graph
+                fails on the inputs, or its outputs are not valid map elements.
         """
         outputs = self.run(self.prepare(images, meta=meta, stream=stream))
         elements = self.elements(outputs)
@@ -233,6 +233,12 @@ class OnnxInferencer:
                     f"{array.shape}."
                 )
         stacked = np.stack(list(map(np.asarray, images)))  # (V, H, W, 3)
+        for name, array in {"images": stacked, **inputs}.items():
+            if not np.isfinite(array).all():
+                raise InputError(
+                    f"{name} of {self.path.name} must be finite: the sample has NaN or infinity in "
+                    "it, or in a matrix from which it is computed."
+                )
         pixels = np.ascontiguousarray(stacked.transpose(0, 3, 1, 2), dtype=np.float32)
         if self.prior_shape is not None:
             inputs[PRIOR_INPUT] = self._read_window(meta)
