@@ -28,6 +28,8 @@ CAMERAS = {"CAM_FRONT": "/front", "CAM_BACK": "/rear"}
 VEHICLE = "base_footprint"  # x ahead, y left, on the road below the rear axle
 MIN_SCORE = 0.3
 PERIOD_S = 0.5
+# Encodings of images that the node takes, and the channels of red, green and blue in them.
+ENCODINGS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
 # RGB of the classes divider, ped_crossing and boundary, in the order of the model's labels.
 COLOURS = [(0.2, 0.6, 1.0), (1.0, 0.6, 0.1), (0.2, 0.8, 0.3)]
 
@@ -103,11 +105,21 @@ class MapNode(Node):
 
 
 def rgb(message: Any) -> np.ndarray:
-    """RGB pixels of an image message with encoding rgb8 or bgr8. (H, W, 3)"""
+    """RGB pixels of an image message. (H, W, 3)
+
+    Raises:
+        ValueError: If its encoding is not one of ``ENCODINGS``.
+    """
+    encoding = message.encoding
+    if encoding not in ENCODINGS:
+        frame = message.header.frame_id
+        known = ", ".join(ENCODINGS)
+        raise ValueError(f"images of {frame} have encoding {encoding!r}: convert them to {known}.")
+    num_channels = len(encoding) - 1  # 3 letters of colours, or 4 with the alpha channel
     # A row has `step` bytes, which may include padding at its end.
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
-    pixels = rows[:, : 3 * message.width].reshape(message.height, message.width, 3)
-    return pixels[..., ::-1] if message.encoding == "bgr8" else pixels
+    pixels = rows[:, : num_channels * message.width].reshape(message.height, message.width, -1)
+    return pixels[..., ENCODINGS[encoding]]
 
 
 def markers(elements: MapElements, stamp: Any) -> Iterator[Any]:

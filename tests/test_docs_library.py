@@ -150,6 +150,14 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
         node.topics[f"/{place}/camera_info"](Message(header=header, p=p))
     image = scope["rgb"](node.images["CAM_FRONT"])
     np.testing.assert_array_equal(image, pixels[:, :400, ::-1])
+    for encoding, channels in {"rgba8": [2, 1, 0, 3], "bgra8": [0, 1, 2, 3]}.items():
+        four = np.insert(pixels, 3, values=9, axis=2)[..., channels].tobytes()
+        shape = {"height": 225, "width": 400, "step": 4 * 410, "encoding": encoding}
+        np.testing.assert_array_equal(scope["rgb"](Message(data=four, **shape)), image)
+    for encoding in ("mono8", "rgb16", "8UC3", "bayer_rggb8"):
+        foreign = Message(header=header, encoding=encoding)
+        with pytest.raises(ValueError, match=f"of rear_optical have encoding '{encoding}': conv"):
+            scope["rgb"](foreign)
     rigs, live = [], node.inferencer.live
 
     def scored(intrinsics, cam_from_frame, frame, **options):
