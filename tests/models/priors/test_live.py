@@ -34,3 +34,8 @@ def test_a_live_map_fuses_elements_and_refuses_to_write_at_its_start(tmp_path):
     assert not any(np.abs(line[:, 0] - 3.0).max() < 1e-3 for line in elsewhere.polylines)
     with pytest.raises(ValueError, match="has elements, which a model can only read"):
         inferencer.live(intrinsics, cam_from_frame, frame="lidar", prior=prior, update_prior=True)
+    with pytest.raises(ValueError, match="there is no prior to update: give one"):
+        inferencer.live(intrinsics, cam_from_frame, update_prior=True)
+    dataset = inferencer.dataset([sample], tmp_path)
+    with pytest.raises(ValueError, match="there is no prior to update: give one"):
+        next(inferencer.predict(dataset, update_priors=True))

@@ -89,7 +89,8 @@ class LiveMap:
         update_prior: Whether to write the prediction of each frame to ``prior``.
 
     Raises:
-        ValueError: If a prior is given and the model reads no prior, or the prior does not fit it.
+        ValueError: If a prior is given or is to be updated and the model reads no prior, the prior
+            does not fit it, or none is given and it is to be updated.
     """
 
     def __init__(
@@ -104,7 +105,7 @@ class LiveMap:
     ):
         self._priors = () if prior is None else (prior,)
         self._update_prior = update_prior
-        if prior is not None:  # called for its errors; the result is not needed here
+        if self._priors or update_prior:  # called for its errors; the result is not needed here
             maps_for(inferencer.model, self._priors, update=update_prior)
         self._inferencer = inferencer
         self._config = inferencer.cfg.test_dataloader.dataset

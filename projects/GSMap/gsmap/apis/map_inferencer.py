@@ -448,7 +448,7 @@ class MapInferencer:
             ValueError: If the model takes no prior, if a prior does not fit it, or if a model with
                 a prior is on several devices.
         """
-        if priors:
+        if priors or update:
             maps = maps_for(self.model, priors, update=update)
         elif self.model.prior is not None:
             maps = self.model.prior.new_maps()

@@ -38,9 +38,11 @@ def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> 
 
     Raises:
         ValueError: If the model takes no prior, if a prior does not fit it, if two priors are of
-            one place, or if ``update`` is set and the model writes to no prior.
+            one place, or if ``update`` is set and there is no prior or the model writes to none.
     """
     require_prior(model)
+    if update and not priors:
+        raise InputError("there is no prior to update: give one, or leave the update out.")
     return model.prior.maps_of(priors, update=update)
 
 
