@@ -151,6 +151,10 @@ def build_evaluator(args: argparse.Namespace, settings: MetricSettings) -> MapEv
     if args.min_score is not None and not uses_min_score:
         takers = [name for name in metric_files() if metric_class(name).takes_min_score]
         raise InputError(f"--min-score applies to {', '.join(takers)}: leave it out.")
+    uses_thresholds = any(metric.takes_thresholds for metric in evaluator.metrics)
+    if settings.thresholds and not (uses_thresholds or args.consistency):
+        takers = [name for name in metric_files() if metric_class(name).takes_thresholds]
+        raise InputError(f"--thresholds and --hard apply to {', '.join(takers)}: leave them out.")
     if args.pr_curves and not any(metric.has_curves for metric in evaluator.metrics):
         raise InputError(
             "--pr-curves draws metrics that rank predictions over all samples: name chamfer or "
@@ -298,7 +302,7 @@ def main(argv: list[str] | None = None) -> str:
         analyses.append(group_report(ranked, groups, args, evaluator))
     analyses.extend(unranked)
     if args.consistency:
-        analyses.append(consistency_report(args))
+        analyses.append(consistency_report(args, settings))
     if args.uncertainty:
         analyses.append(uncertainty_report(args, settings))
     print_reports([*ranked, *analyses], notes, args)

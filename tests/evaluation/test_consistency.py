@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -246,6 +247,11 @@ def test_the_command_scores_drives_and_writes_tracks(files, tmp_path, capsys):
     assert "consistency/C-mAP" in capsys.readouterr().out
     assert json.loads(figures.read_text())["consistency/C-mAP"] == pytest.approx(1 / 3)
     evaluate.main([str(tracks), *words])
+    for metric in ("chamfer", "raster"):
+        words[2] = metric
+        evaluate.main([str(results), *words, "--hard", "--out", str(figures)])
+        found = set(re.findall(r"consistency/CAP@([\d.]+)", figures.read_text()))
+        assert found == {"0.2", "0.5", "1.0"}
     with pytest.raises(FileNotFoundError, match=r"gone\.json"):
         evaluate.main([str(tmp_path / "gone.json"), *words])
     tracks.write_text(tracks.read_text().replace('"sample_token":"1"', '"sample_token":"x"'))

@@ -1,6 +1,7 @@
 """A metric of one's own: one file, found by its name through the command, the config and shards."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -28,39 +29,8 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from tools.merge import main as merge
 
-OWN_METRIC = '''
-from dataclasses import dataclass
-
-import numpy as np
-
-from gsmap.evaluation import Metric, MetricReport, SampleValues, register_metric
-
-
-@register_metric
-@dataclass(frozen=True)
-class Lengths(Metric):
-    """Metres of predicted lines for each metre of true ones."""
-
-    name = "lengths"
-
-    classes: tuple[str, ...]
-
-    @classmethod
-    def from_settings(cls, settings):
-        return cls(settings.classes)
-
-    def match(self, sample):
-        metres = np.zeros((2, len(self.classes)))
-        for row, side in zip(metres, (sample.predictions, sample.ground_truth)):
-            for line, label in zip(side.polylines, side.labels):
-                row[label] += np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
-        return SampleValues(sample.token, {"metres": metres})
-
-    def reports(self, table):
-        found, true = np.sum(table.column("metres"), axis=0)
-        figures = dict(zip(self.classes, found / np.maximum(true, 1)))
-        return [MetricReport.of_figures(self.name, figures, table.tokens)]
-'''
+PAGE = Path(__file__).resolve().parents[2] / "docs/evaluation.md"
+(OWN_METRIC,) = re.findall(r"```python\n(.*?@register_metric.*?)```", PAGE.read_text(), re.DOTALL)
 
 
 @pytest.fixture

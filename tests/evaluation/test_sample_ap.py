@@ -378,6 +378,8 @@ def test_bad_settings_are_refused(tmp_path):
             ["--min-score", "0.4"],
             "--min-score applies to topology, bemapnet, hdmapnet: leave it out",
         ),
+        (["--eval", "raster", "--hard"], "--thresholds and --hard apply to chamfer, heights, pld:"),
+        (["--eval", "hdmapnet", "topology", "--thresholds", "1"], "--thresholds and --hard apply"),
         (["--eval", "pld", "--bootstrap"], "apply to AP: name chamfer or raster"),
         (["--eval", "chamfers"], "there is no metric .*'chamfers'"),
     ):

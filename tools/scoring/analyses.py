@@ -64,7 +64,7 @@ def polygon_labels(args: argparse.Namespace, classes: Sequence[str]) -> list[int
     return [label for label, name in enumerate(classes) if name in args.polygon_classes]
 
 
-def consistency_report(args: argparse.Namespace) -> MetricReport:
+def consistency_report(args: argparse.Namespace, settings: MetricSettings) -> MetricReport:
     """Score the drives of a result file; with ``--tracks``, write its tracks."""
     from gsmap.evaluation.analysis.consistency import ConsistencyConfig
     from gsmap.evaluation.analysis.drive_files import evaluate_drives
@@ -76,12 +76,11 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
         )
     annotations = AnnotationFile(args.ground_truth)
     meta = annotations.meta
-    classes = tuple(args.classes or meta.classes)
     config = ConsistencyConfig(
-        classes=classes,
+        classes=settings.classes,
         grid=BEVGrid(meta.x_range, meta.y_range),
-        filled_classes=tuple(polygon_labels(args, classes)),
-        thresholds=tuple(args.thresholds or CHAMFER_THRESHOLDS),
+        filled_classes=settings.areas,
+        thresholds=settings.thresholds or CHAMFER_THRESHOLDS,
     )
     figures = evaluate_drives(args.results, annotations, config=config, tracks_file=args.tracks)
     # `groups` and `detections` concern metrics with an AP.

@@ -82,6 +82,7 @@ class ChamferConfig(Metric):
     name: ClassVar[str] = "chamfer"
     ranks: ClassVar[bool] = True  # predictions are ranked over all samples
     has_curves: ClassVar[bool] = True  # precision-recall curves can be drawn
+    takes_thresholds: ClassVar[bool] = True
 
     classes: tuple[str, ...]
     thresholds: tuple[float, ...] = CHAMFER_THRESHOLDS
@@ -131,6 +132,7 @@ class HardChamferConfig(ChamferConfig):
 
     name: ClassVar[str] = "chamfer_hard"
     companions: ClassVar[tuple[str, ...]] = ("chamfer",)  # metrics that are reported, too
+    takes_thresholds: ClassVar[bool] = False
 
     @classmethod
     def from_settings(cls, settings: MetricSettings) -> "HardChamferConfig":

@@ -164,6 +164,7 @@ class Metric(ABC):
             `FrameMatches` and reports have ``detections``, for intervals, groups and curves.
         has_curves: Whether precision-recall curves describe the metric.
         takes_min_score: Whether the metric uses `MetricSettings.min_score`.
+        takes_thresholds: Whether the metric uses `MetricSettings.thresholds`.
         classes: Names of the classes; a label is an index into them.
     """
 
@@ -172,6 +173,7 @@ class Metric(ABC):
     ranks: ClassVar[bool] = False
     has_curves: ClassVar[bool] = False
     takes_min_score: ClassVar[bool] = False
+    takes_thresholds: ClassVar[bool] = False
     classes: tuple[str, ...]
 
     @classmethod

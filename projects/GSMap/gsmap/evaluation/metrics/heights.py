@@ -40,6 +40,7 @@ class Heights(Metric):
     """
 
     name: ClassVar[str] = "heights"
+    takes_thresholds: ClassVar[bool] = True
 
     classes: tuple[str, ...]
     thresholds: tuple[float, ...] = CHAMFER_THRESHOLDS

@@ -218,6 +218,7 @@ class PLD(Metric):
     """
 
     name: ClassVar[str] = "pld"
+    takes_thresholds: ClassVar[bool] = True
 
     classes: tuple[str, ...]
     cutoffs_m: tuple[float, ...] = CHAMFER_THRESHOLDS

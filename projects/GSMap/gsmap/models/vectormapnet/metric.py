@@ -25,6 +25,7 @@ class VectorMapNetAP(ChamferConfig):
 
     name: ClassVar[str] = "vectormapnet"
     companions: ClassVar[tuple[str, ...]] = ("chamfer",)  # metrics reported before it
+    takes_thresholds: ClassVar[bool] = False
 
     @classmethod
     def from_settings(cls, settings: MetricSettings) -> "VectorMapNetAP":
