@@ -69,6 +69,16 @@ def test_a_ring_that_leaves_the_range_stays_a_ring(tmp_path: Path):
     assert elements(tmp_path, {"label": 1, "points": [[40, 0], [50, 0], [50, 5], [40, 0]]}) == []
 
 
+@pytest.mark.parametrize("label", [0, 2])
+def test_a_closed_line_is_open_where_it_leaves_the_range(label: int, tmp_path: Path):
+    island = [[25, 6], [35, 6], [35, 24], [25, 24], [25, 6]]
+    (line,) = elements(tmp_path, {"label": label, "points": island})
+    np.testing.assert_allclose(line.points, [[25, 15], [25, 6], [30, 6]])
+    inside = [[20, 6], [28, 6], [28, 12], [20, 6]]
+    (ring,) = elements(tmp_path, {"label": label, "points": inside})
+    np.testing.assert_array_equal(ring.points, inside)
+
+
 def test_height_is_interpolated_where_a_line_is_cut(tmp_path: Path):
     meta = AnnotationMeta("mine", "ego", "train", x_range=(-30, 30), y_range=(-15, 15), dim=3)
     (line,) = elements(tmp_path, {"label": 0, "points": [[20, 0, 0], [40, 0, 2]]}, meta=meta)
@@ -177,6 +187,24 @@ def test_a_map_in_pieces_is_joined_on_request(tmp_path: Path):
     assert sorted(whole[:, 0].tolist()) == [-20, 0, 20]
     (crossing,) = [item.points for item in found if item.label == 1]
     np.testing.assert_array_equal(crossing, ring)
+
+
+def test_a_line_of_two_lanes_is_one_line(tmp_path: Path):
+    line = np.array([[0, 0], [10, 0], [20, 1.0]])
+    onward = np.array([[20, 1], [25, 1], [28, 2.0]])
+    ring = np.array([[8, -4], [11, -4], [11, 4], [8, -4.0]])
+    turned = ring[[1, 2, 0, 1]]
+    copies = [line, line[::-1], line + 1e-9, onward, onward, ring, ring[::-1], turned]
+    pieces = []
+    for points in copies:
+        pieces.append({"label": 0, "points": points})
+    pieces.append({"label": 2, "points": line})  # another class
+    from_records(tmp_path / "j.arrow", [record(instances=pieces)], META, tmp_path, join=True)
+    found = AnnotationFile(tmp_path / "j.arrow")[0].instances
+    assert [item.label for item in found] == [0, 0, 2]
+    np.testing.assert_array_equal(found[0].points, ring)
+    assert sorted(found[1].points[:, 0].tolist()) == [0, 10, 20, 25, 28]
+    np.testing.assert_array_equal(found[2].points, line)
 
 
 def test_joined_pieces_keep_their_heights(tmp_path: Path):

@@ -21,6 +21,7 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size, read_image
+from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.errors import InputError
@@ -75,7 +76,8 @@ def from_records(
       docs/inference.md) the image is rectified into ``rectified/`` of the data root;
     - ``instances``: mappings with ``label`` (name or index) and ``points`` (n, 2 or 3) in metres.
       The first and the last point of a ring are equal. Elements are clipped to the range of
-      ``meta``; rings stay rings. Without this key and the next one, the sample has no ground truth;
+      ``meta``; rings of areas stay rings. Without this key and the next one, the sample has no
+      ground truth;
     - ``global_instances``: elements in the global frame in place of ``instances``, such as a whole
       map. They are transformed to the frame by the position and the yaw of ``global_from_frame``
       or, in annotation files with heights, by the whole pose;
@@ -178,7 +180,7 @@ def _clip_elements(
     pieces = []
     for element in elements:
         points = np.asarray(element.points, np.float64)
-        for piece in _clip(points, meta):
+        for piece in _clip(points, label=element.label, meta=meta):
             pieces.append(MapInstance(label=element.label, points=piece))
     return pieces
 
@@ -188,7 +190,8 @@ def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
 
     Two ends meet if they are within 0.1 m of each other in the plane. Lines are joined at places
     where exactly two ends meet, but not at forks, where three or more meet. Lines may be reversed.
-    Rings are not changed.
+    Rings are not changed. Copies of a line or a ring are left out: some maps store the line
+    between two lanes with each of them.
 
     Args:
         instances: Map elements, in metres.
@@ -197,21 +200,35 @@ def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
         The rings, then the joined lines of each class.
     """
     joined = []
+    rings_of: dict[int, list[np.ndarray]] = {}  # rings by label
     lines_of: dict[int, list[np.ndarray]] = {}  # lines by label
     for instance in instances:
-        if is_closed(np.asarray(instance.points)):
-            joined.append(instance)
-        else:
-            line = np.array(instance.points, np.float64)
-            lines_of.setdefault(instance.label, []).append(line)
+        points = np.array(instance.points, np.float64)
+        points_of = rings_of if is_closed(points) else lines_of
+        points_of.setdefault(instance.label, []).append(points)
+    for label, rings in rings_of.items():
+        for points in _without_copies(rings):
+            joined.append(MapInstance(label=label, points=points))
     for label in sorted(lines_of):
-        lines = lines_of[label]
-        _snap_ends(lines)
+        _snap_ends(lines_of[label])
+        lines = _without_copies(lines_of[label])
         parts = shapely.get_parts(shapely.line_merge(shapely.MultiLineString(lines)))
         # `vertices_of` returns the vertices of each joined line.
         for points in vertices_of(parts, dim=lines[0].shape[1]):
             joined.append(MapInstance(label=label, points=points))
     return joined
+
+
+def _without_copies(lines: Sequence[Points]) -> list[Points]:
+    """Lines that differ from all earlier ones by a millimetre or more. (n, dim) each
+
+    The direction of a line does not count, nor does the start of a ring.
+    """
+    first_of: dict[shapely.Geometry, Points] = {}
+    for line in lines:
+        rounded = line.round(3) + 0.0  # the sum turns -0.0 into 0.0, which has another hash
+        first_of.setdefault(shapely.normalize(shapely.LineString(rounded)), line)
+    return list(first_of.values())
 
 
 def _snap_ends(lines: Sequence[Points]) -> None:
@@ -354,12 +371,16 @@ def _class_index(label: Any, meta: AnnotationMeta) -> int:
     return meta.classes.index(label)
 
 
-def _clip(points: Points, meta: AnnotationMeta) -> list[Points]:
-    """Clip an element to the range of an annotation file; rings stay rings. (n, dim) each"""
+def _clip(points: Points, label: int, meta: AnnotationMeta) -> list[Points]:
+    """Clip an element to the range of an annotation file. (n, dim) each
+
+    Rings of areas stay rings. Other rings that leave the range are cut into open lines, so that the
+    border of the range is not part of the ground truth.
+    """
     low, high = np.array([meta.x_range, meta.y_range]).T
     if ((points[:, :2] >= low) & (points[:, :2] <= high)).all():
         return [points]
-    if not is_closed(points):
+    if meta.classes[label] not in AREA_CLASSES or not is_closed(points):
         return list(clip_to_box(points, x_range=meta.x_range, y_range=meta.y_range))
     polygon = shapely.Polygon(points)
     if not polygon.is_valid:
