@@ -177,7 +177,7 @@ class AtomicCheckpointHook(CheckpointHook):
         source = runner._load_from  # file or address of the checkpoint
         if runner._resume:
             check_resumable(checkpoint, runner=runner, path=source)
-        with refusing(source):  # errors name the source and a remedy
+        with refusing(path=source):  # errors name the source and a remedy
             state = unwrap(checkpoint).state  # weights, with the keys of an unwrapped model
         # Other training loops store the weights elsewhere, or below a prefix.
         if state.keys() != checkpoint.get("state_dict", {}).keys():
@@ -191,7 +191,7 @@ class AtomicCheckpointHook(CheckpointHook):
             # The check needs the parameter groups of this run, so it follows the conversion.
             fit_optimizer_state(checkpoint, wrapper=wrapper)
             if isinstance(wrapper, OptimWrapper):  # a dict of wrappers has several optimizers
-                with refusing_state(source):  # a malformed state becomes a ValueError
+                with refusing_state(path=source):  # a malformed state becomes a ValueError
                     check_optimizer_state(
                         checkpoint["optimizer"], optimizer=wrapper.optimizer, path=source
                     )

@@ -81,7 +81,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     else:
         path = find_config(config)
         # `reading_config` names the config, or the part of it, in the message of an error.
-        with reading_config(path):
+        with reading_config(source=path):
             cfg = Config.fromfile(path, import_custom_modules=False)
     options = dict(cfg_options or {})
     factor = options.pop("image_scale", None)
@@ -93,13 +93,13 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     check_kinds(cfg.to_dict(), overrides=options, source=cfg.filename or "the config")
     if data_root is not None:  # before the overrides, which may set another root for a split
         _set_data_root(cfg, data_root=str(data_root))
-    with reading_config(f"--cfg-options of {cfg.filename or 'a config'}"):
+    with reading_config(source=f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(options)
     if factor is not None:
         _scale_images(cfg, factor=factor)
     _check_keys(cfg)
     _fit_loaders(cfg)
-    with reading_config(f"custom_imports of {cfg.filename or 'a config'}"):
+    with reading_config(source=f"custom_imports of {cfg.filename or 'a config'}"):
         import_modules_from_strings(["gsmap.registered"])  # registers the classes of GSMap
         import_modules_from_strings(**cfg.get("custom_imports", {"imports": []}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
@@ -115,13 +115,13 @@ def _set_data_root(cfg: Config, data_root: str) -> None:
     """
     datasets: list[Any] = []
     for split in ("train", "val", "test"):
-        loader = cfg.get(f"{split}_dataloader") or {}
-        if loader.get("dataset"):
-            datasets += innermost_datasets(loader.dataset)
+        dataset = (cfg.get(f"{split}_dataloader") or {}).get("dataset")
+        if dataset:
+            datasets += innermost_datasets(dataset)
     if not datasets:
         raise InputError(f"--data-root: {cfg.filename} has no data set.")
-    for dataset in datasets:
-        dataset.data_root = data_root
+    for innermost_dataset in datasets:
+        innermost_dataset.data_root = data_root
 
 
 def _scale_images(cfg: Config, factor: float) -> None:
@@ -495,7 +495,7 @@ def has_trained_memory(cfg: Config) -> bool:
     model = cfg.get("model") or {}
     if _has_trained_stream_memory(model.get("temporal") or {}):
         return True
-    prior_class = class_of_type((model.get("prior") or {}).get("type"))
+    prior_class = class_of_type(kind=(model.get("prior") or {}).get("type"))
     return getattr(prior_class, "reads_window", False)
 
 
@@ -509,7 +509,7 @@ def _check_memory_loop(cfg: Config) -> None:
     kind = settings.get("type")
     by_iterations = not settings.get("by_epoch", True)
     if kind is not None:
-        loop_class = class_of_type(kind, registry=LOOPS) or object
+        loop_class = class_of_type(kind=kind, registry=LOOPS) or object
         by_iterations = issubclass(loop_class, IterBasedTrainLoop)
     if by_iterations and has_trained_memory(cfg):
         raise InputError(
@@ -536,7 +536,7 @@ def _check_streams(cfg: Config) -> None:
         kind = sampler.get("type")
         # For an unknown type, `class_of_type` returns None. `object` then takes its place, whose
         # name is not the needed one.
-        sampler_class = class_of_type(kind, registry=DATA_SAMPLERS) or object
+        sampler_class = class_of_type(kind=kind, registry=DATA_SAMPLERS) or object
         # Subclasses of the needed sampler are allowed.
         class_names = {base.__name__ for base in sampler_class.__mro__}
         if loader and needed_sampler not in class_names:

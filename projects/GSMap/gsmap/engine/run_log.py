@@ -114,7 +114,7 @@ class MapRunner(Runner):
         Raises:
             ValueError: If the state does not fit this run.
         """
-        with refusing_state(filename):
+        with refusing_state(path=filename):
             super().resume(
                 filename,
                 resume_optimizer=resume_optimizer,
