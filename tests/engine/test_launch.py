@@ -228,7 +228,7 @@ def test_loaders_that_tear_streams_apart_are_refused(changes, reason):
 @pytest.mark.parametrize(
     "loop", [{"type": "IterBasedTrainLoop", "max_iters": 10}, {"by_epoch": False, "max_iters": 10}]
 )
-@pytest.mark.parametrize("name", ["streammapnet_r18_minicity", "hrmapnet_r18_minicity"])
+@pytest.mark.parametrize("name", ["gsmap_stream_r18_minicity", "hrmapnet_r18_minicity"])
 def test_a_loop_that_would_empty_the_memory_in_each_iteration_is_refused(name, loop):
     cfg = read_config(name)
     cfg.param_scheduler = []

@@ -1,6 +1,7 @@
 """Precision and recall of changes, worked by hand, and files of changes of strangers."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,14 @@ def figures_of(tmp_path: Path, drive: Path, found: list[dict], truth: list[dict]
 
 def line_at(x: float, low: float = -20.0, high: float = 20.0) -> list:
     return [[x, low], [x, high]]
+
+
+def test_a_file_without_poses_is_refused(tmp_path, drive):
+    file = AnnotationFile(drive)
+    meta = replace(file.meta, options={"poses": False})
+    write_annotations(tmp_path / "val.arrow", meta, list(file))
+    with pytest.raises(ValueError, match="knows no poses, which changes need"):
+        figures_of(tmp_path, drive, [], [])
 
 
 def test_precision_and_recall_of_a_street(tmp_path, drive):

@@ -56,6 +56,16 @@ def test_ring_is_filled_or_outlined(backend):
     assert (outlined[[0, 1, 2], [2, 1, 3]] == 1).all()
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_row_through_a_vertex_is_filled_once(backend):
+    """Vertices are at the centres of rows, which rounding of their places may leave out."""
+    grid = BEVGrid((-51.2, 51.2), (-51.2, 51.2), 512, 512)
+    ring = torch.tensor([[[-10.0, -51.0], [10.0, -50.5], [5.0, -45.2], [-10.0, -45.0]]])
+    mask = draw_polylines(ring, grid, filled=yes(True), backend=backend)
+    exact = draw_polylines(ring.double(), grid, filled=yes(True), backend="reference")
+    torch.testing.assert_close(mask, exact.float(), atol=1e-4, rtol=0)
+
+
 @pytest.mark.usefixtures("poisoned_empty")
 def test_fused_drawing_equals_the_float64_reference():
     grid = BEVGrid((-15, 15), (-30, 30), 41, 33)

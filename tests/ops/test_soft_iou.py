@@ -58,6 +58,11 @@ def test_gradient_is_given_where_it_is_asked_for():
     torch.testing.assert_close(single.grad, preds.grad.float())
 
 
+def test_a_fused_kernel_has_no_gradient():
+    preds = sparse_masks(2, 0).requires_grad_()
+    assert not pairwise_soft_iou(preds, sparse_masks(3, 1), backend="cpu").requires_grad
+
+
 def test_shapes_that_disagree_are_named():
     with pytest.raises(ValueError, match=r"\(2, 4, 5\) and \(2, 5, 4\)"):
         pairwise_soft_iou(torch.zeros(2, 4, 5), torch.zeros(2, 5, 4))

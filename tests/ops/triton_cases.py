@@ -377,6 +377,16 @@ def soft_rasters_equal_float64(device, count, distance, spread=1.0):
 
 
 @case("soft_rasters")
+def soft_rasters_with_a_vertex_a_hair_beside_a_row(device):
+    hair = float(torch.nextafter(torch.tensor(1.0), torch.tensor(2.0)))
+    ring = torch.tensor([[[3.0, 100.0], [20.0, hair], [18.0, -5.0], [3.0, -5.0]]])
+    kinds = torch.tensor([True])
+    out = soft_rasters(ring.to(device), 8, 32, is_polygon=kinds.to(device), backend="triton")
+    true = soft_rasters(ring.double(), 8, 32, is_polygon=kinds, backend="reference")
+    torch.testing.assert_close(out.cpu(), true.float(), atol=1e-5, rtol=0)
+
+
+@case("soft_rasters")
 def soft_rasters_of_nothing_and_of_no_numbers(device):
     empty = torch.zeros(0, 20, 2, device=device, requires_grad=True)
     masks = soft_rasters(empty, 7, 9, backend="triton")

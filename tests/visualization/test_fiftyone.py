@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import AnnotationMeta
-from gsmap.visualization.fiftyone import write_fiftyone
+from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord
+from gsmap.visualization.fiftyone import _visible_parts, write_fiftyone
 from mapdata.custom import from_records
 
 META = AnnotationMeta("mine", "ego", "val", ground_z_m=0.0)
@@ -36,7 +36,7 @@ def test_elements_are_polylines_in_the_images_of_a_group(annotations, tmp_path):
     content = {"results": [{"sample_token": "a", "vectors": [vector]}]}
     results = tmp_path / "results.json"
     results.write_text(json.dumps(content))
-    assert write_fiftyone(tmp_path / "out.json", annotations, results=results) == 2
+    assert write_fiftyone(tmp_path / "out.json", annotations, results=results) == (2, [])
     found = json.loads((tmp_path / "out.json").read_text())
     assert found["group_media_types"] == {"front": "image", "rear": "image"}
     front, rear = found["samples"]
@@ -63,6 +63,27 @@ def test_results_of_other_samples_are_refused(annotations, tmp_path):
         write_fiftyone(tmp_path / "out.json", annotations, results=results)
     assert len(AnnotationFile(annotations)) == 1
     assert not (tmp_path / "out.json").exists()
+
+
+def test_what_is_left_out_is_named(annotations, tmp_path):
+    tree = {"cls_name": "tree", "pts": [[0, 0], [1, 1]], "confidence_level": 0.5}
+    samples = [{"sample_token": "a", "vectors": [tree]}, {"sample_token": "b", "vectors": []}]
+    results = tmp_path / "results.json"
+    results.write_text(json.dumps({"results": samples}))
+    _, notes = write_fiftyone(tmp_path / "out.json", annotations, results=results)
+    assert notes == [
+        "1 result has no ground truth, such as 'b': left out",
+        "1 predictions of class 'tree' are left out",
+    ]
+
+
+def test_a_line_that_leaves_the_image_at_a_corner_has_two_parts():
+    intrinsics = np.array([[500.0, 0, 400], [0, 500, 300], [0, 0, 1]])
+    camera = CameraRecord("front", "a.jpg", 800, 600, intrinsics, np.eye(4))
+    corner = np.array([[3.0, 1.5, 3.0], [0.7, 1.5, 2.1], [-3.0, 1.5, 3.0]])
+    first, second = _visible_parts(corner, camera)
+    assert first[-1][1] == second[0][1] == 1.0  # both end at the lower border
+    assert first[-1][0] > second[0][0]
 
 
 def test_the_ground_is_below_the_sensor_that_the_sample_has(tmp_path):

@@ -124,6 +124,11 @@ def test_cameras_project_the_height_of_points(z, row):
     assert rows.mean() / len(window) * 90 == pytest.approx(row, abs=0.5)
 
 
+def test_names_with_dollar_signs_are_no_formulas():
+    panel = BEVPanel("cost_$5^_vs_$6", elements(), note="a$ b$^")
+    figure_to_rgb(compose_figure([], [panel], GRID, VIEW, STYLE, title="$_ $"))
+
+
 def test_bird_s_eye_views_ignore_the_height_of_points():
     extra = {
         "scores": np.array([0.9, 0.5]),

@@ -352,6 +352,10 @@ def test_a_change_far_from_the_origin_is_at_its_place_in_the_frame_of_a_tilted_v
     feature["geometry"]["coordinates"] = [[4000.0, 2505], [4000, 2510]]
     content["features"] = [feature]
     (tmp_path / "changes.geojson").write_text(json.dumps(content))
-    layer = ChangeLayer(tmp_path / "changes.geojson", AnnotationFile(annotations))
+    file = AnnotationFile(annotations)
+    layer = ChangeLayer(tmp_path / "changes.geojson", file)
     (entry,) = layer.entries(sample, FRAME_VIEWS["lidar"])
     assert entry["p"] == [0, 500, 0, 1000]
+    write_annotations(annotations, replace(file.meta, options={"poses": False}), list(file))
+    with pytest.raises(ValueError, match="knows no poses, which changes need"):
+        ChangeLayer(tmp_path / "changes.geojson", AnnotationFile(annotations))

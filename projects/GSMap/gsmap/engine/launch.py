@@ -18,7 +18,6 @@ from mmdet3d.registry import DATA_SAMPLERS, LOOPS, OPTIMIZERS, RUNNERS
 from mmengine.config import Config, ConfigDict
 from mmengine.logging import print_log
 from mmengine.registry import Registry, init_default_scope
-from mmengine.runner import IterBasedTrainLoop
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.checkpoints.building import reading_config
@@ -509,6 +508,8 @@ def _check_memory_loop(cfg: Config) -> None:
     kind = settings.get("type")
     by_iterations = not settings.get("by_epoch", True)
     if kind is not None:
+        from mmengine.runner import IterBasedTrainLoop  # slow to import
+
         loop_class = class_of_type(kind=kind, registry=LOOPS) or object
         by_iterations = issubclass(loop_class, IterBasedTrainLoop)
     if by_iterations and has_trained_memory(cfg):

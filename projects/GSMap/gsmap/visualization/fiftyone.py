@@ -13,7 +13,8 @@ import numpy as np
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.core.results_json import SampleFile
+from gsmap.evaluation.core.file_evaluation import mismatch_notes
+from gsmap.evaluation.core.results_json import THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FrameView, frame_view
 from gsmap.utils.cli import output_file
@@ -35,7 +36,7 @@ def write_fiftyone(
     annotations: str | Path,
     results: str | Path | None = None,
     data_root: str | Path | None = None,
-) -> int:
+) -> tuple[int, list[str]]:
     """Write a JSON file that ``fiftyone.Dataset.from_json`` loads as a grouped data set.
 
     Each sample of this project becomes a FiftyOne group, whose slices are the images of the
@@ -49,7 +50,7 @@ def write_fiftyone(
         data_root: Folder that image paths are relative to; None for the folder of the annotations.
 
     Returns:
-        Number of images.
+        Number of images, and notes on samples and elements that are left out.
 
     Raises:
         ValueError: If a file is malformed, the result file has no sample of the annotation file, or
@@ -61,9 +62,14 @@ def write_fiftyone(
     # Place (offset and length in bytes) of each sample in the result file, by token. Elements are
     # loaded sample by sample below, so that a large file does not fill the memory.
     places = {}
+    notes: list[str] = []
     if results is not None:
         predictions = SampleFile(results, key="results", classes=file.meta.classes)
         places = {token: place for token, _, place in predictions}  # the elements are not kept
+        notes = mismatch_notes(places, file.column("token"), allowed=True)
+        for name, number in sorted(predictions.ignored.items()):
+            if name != THREE_D:
+                notes.append(f"{number} predictions of class {name!r} are left out")
         if not places.keys() & set(file.column("token")):
             raise InputError(f"{results} has no sample of {annotations}.")
     # Orientation of the annotation frame, and the ground, on which lines without z are drawn.
@@ -80,7 +86,7 @@ def write_fiftyone(
     content = {**_schema(file, samples=samples), "samples": samples}
     with atomic_write(path, "w") as target:
         json.dump(content, target)
-    return len(samples)
+    return len(samples), notes
 
 
 def _schema(file: AnnotationFile, samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -190,10 +196,12 @@ def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[flo
     if not len(segments):
         return []
     shares = np.clip(segments / size_px, 0.0, 1.0).round(_DECIMALS)  # (m, 2, 2)
-    # A part ends where the next visible segment is not the next segment of the line.
+    # A part ends where the next visible segment is not the next segment of the line, or where the
+    # line is outside of the image between the two.
     breaks = []
     for position, (before, after) in enumerate(pairwise(index), start=1):
-        if after != before + 1:
+        is_joined = np.allclose(segments[position - 1, 1], segments[position, 0])
+        if after != before + 1 or not is_joined:
             breaks.append(position)
     parts = []
     for run in np.split(shares, breaks):
@@ -213,10 +221,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> str:
     """Run the command ``fiftyone`` and return its report."""
-    count = write_fiftyone(
+    count, notes = write_fiftyone(
         arguments.target,
         arguments.annotations,
         results=arguments.results,
         data_root=arguments.data_root,
     )
-    return f"{format_count(count, 'image')} written to {arguments.target}"
+    written = f"{format_count(count, 'image')} written to {arguments.target}"
+    return "\n".join([written, *(f"note: {note}" for note in notes)])

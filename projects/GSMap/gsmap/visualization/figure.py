@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -200,6 +201,7 @@ def _draw_header(figure: Figure, title: str, lines: Sequence[Line2D], style: Map
     )
 
 
+@rc_context({"text.parse_math": False})  # names may contain dollar signs
 def compose_figure(
     cameras: Sequence[CameraView],
     panels: Sequence[BEVPanel],

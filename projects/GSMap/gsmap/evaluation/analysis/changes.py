@@ -71,7 +71,12 @@ def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
     """Collect the views of the samples of an annotation file, by the name of their map.
 
     The samples of a map are in the order of the file.
+
+    Raises:
+        ValueError: If the poses of the samples are not known.
     """
+    if not annotations.meta.has_poses:
+        raise InputError(f"{annotations.path} knows no poses, which changes need.")
     poses: dict[str, list[FloatArray]] = {}
     for sample in annotations:
         poses.setdefault(sample.map_name, []).append(level_pose(sample.global_from_frame))

@@ -108,7 +108,8 @@ def _fill_inside(ring, frame, inside):
         top, bottom = pixel_range(
             min(y0, y1), max(y0, y1), origin=y_min, step=step_y, size=len(inside)
         )
-        for row in range(top, bottom):
+        # Rounding may leave out a row whose centre is at a vertex: one more is tested on each side.
+        for row in range(max(top - 1, 0), min(bottom + 1, len(inside))):
             y = y_min + (row + 0.5) * step_y
             if (y0 > y) == (y1 > y):  # both ends are on one side of the row
                 continue

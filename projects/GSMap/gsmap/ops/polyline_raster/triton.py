@@ -89,8 +89,10 @@ def _nearest_edges(ring, num_edges, count, x, y, eps, TILE: tl.constexpr):
         edge_index = tl.where(closer, edge, edge_index)
         # The ray from the pixel towards larger x crosses the edge: it changes between outside and
         # inside (even-odd rule). Offsets are relative to the start of the edge.
-        # Each comparison is whether an end of the edge lies above the pixel (larger y).
-        straddles = (offset_y < 0) != (offset_y < edge_y)
+        # Each comparison is whether an end of the edge lies above the pixel (larger y). Both ends
+        # are loaded, so that two edges agree on the vertex between them.
+        y1 = tl.load(ring + 2 * tl.where(edge + 1 < count, edge + 1, 0) + 1)
+        straddles = (y < y0) != (y < y1)
         rise = tl.where(edge_y == 0, 1.0, edge_y)  # no division by 0
         inside ^= (straddles & (offset_x < edge_x * offset_y / rise)).to(tl.int32)
     return nearest, edge_index, inside != 0, poison

@@ -53,7 +53,9 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
     if backend == "reference":
         minima = pairwise_minima_reference(preds, targets)
     else:
-        minima = _pairwise_minima(preds.detach(), targets.detach(), backend)
+        preds = preds.detach()
+        targets = targets.detach()
+        minima = _pairwise_minima(preds, targets, backend)
     return _iou(minima, preds.sum(-1)[:, None], target_sums=targets.sum(-1))
 
 

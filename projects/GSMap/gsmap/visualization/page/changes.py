@@ -19,6 +19,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FrameView
 from gsmap.structures.polylines import clip_to_box, is_closed
 from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.errors import InputError
 from gsmap.utils.words import format_count
 from gsmap.visualization.page.frames import to_centimetres
 from gsmap.visualization.page.tables import Table
@@ -33,10 +34,12 @@ class ChangeLayer:
 
     Raises:
         FileNotFoundError: If the file of changes does not exist.
-        ValueError: If the file of changes is malformed.
+        ValueError: If the file of changes is malformed, or the annotation file has no poses.
     """
 
     def __init__(self, path: Path | None, file: AnnotationFile) -> None:
+        if path and not file.meta.has_poses:
+            raise InputError(f"{file.path} knows no poses, which changes need.")
         maps = sorted(set(file.column("map_name")))
         changes = read_changes(path) if path else []
         # Changes that name no map get the name of the only map of the annotation file.
