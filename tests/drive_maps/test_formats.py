@@ -1,7 +1,9 @@
 import json
 import math
+import re
 import sys
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import av
 import numpy as np
@@ -208,6 +210,31 @@ def test_rerun_recording_holds_cameras_lines_and_gaussians(tmp_path, camera_driv
     assert content[:3] == b"RRF"
     for entity in (b"/world/map", b"/world/vehicle/CAM_FRONT", b"predictions/gaussians"):
         assert entity in content
+
+
+@pytest.mark.parametrize("east_m", [0.0, 39_512_000.0])
+def test_rerun_gets_positions_from_the_start_of_the_drive(tmp_path, monkeypatch, true, east_m):
+    """Its coordinates are float32, which has steps of 4 m at the second easting."""
+    rerun = MagicMock()
+    stream = rerun.RecordingStream.return_value.binary_stream.return_value
+    stream.read.return_value = b""
+    monkeypatch.setattr("drivemaps.rerun.import_extra", lambda *_: rerun)
+    shift = np.eye(4)
+    shift[0, 3] = east_m
+    frames = []
+    for frame in drive_of().frames[:3]:
+        sample = replace(frame.sample, global_from_frame=shift @ frame.sample.global_from_frame)
+        frames.append(DriveFrame(sample, frame.elements.to_frame(shift)))
+    drive = replace(drive_of(), frames=frames)
+    write_rerun(tmp_path / "drive.rrd", Replay(drive, true.to_frame(shift), "lidar", COLOURS))
+    poses = [call.kwargs["translation"] for call in rerun.Transform3D.call_args_list]
+    expected = [frame.sample.global_from_frame[:3, 3] for frame in frames]
+    (text,) = rerun.TextDocument.call_args.args
+    x, y, z = map(float, re.findall(r"[xyz] (-?\d+)", text))
+    np.testing.assert_allclose(np.float32(poses) + np.array([x, y, z]), expected, atol=1e-4)
+    lines = [call.args[0] for call in rerun.LineStrips3D.call_args_list]
+    points = np.concatenate([point for line in lines for point in line])
+    assert np.abs(points).max() < 100  # of predictions around the vehicle, and of the map
 
 
 @pytest.mark.parametrize(("module", "write"), [("foxglove", write_mcap), ("rerun", write_rerun)])

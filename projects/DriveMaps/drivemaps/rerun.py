@@ -20,13 +20,16 @@ TIMELINE = "time"
 # below its path, so entities below the vehicle are logged in the annotation frame.
 _VEHICLE = "world/vehicle"
 _MAP = "world/map"
+_ORIGIN = "origin"
 
 
 def write_rerun(path: str | Path, replay: Replay) -> None:
     """Write a drive as a rerun recording (``.rrd``).
 
     It contains cameras, predictions, their Gaussians as ellipses, and the growing map. Predictions
-    and map are logged in 3D, so the viewer also projects them into the cameras.
+    and map are logged in 3D, so the viewer also projects them into the cameras. The first position,
+    rounded to metres, is subtracted from the poses and the map, because coordinates of rerun are
+    float32. It is logged as a text.
 
     Args:
         path: File to write.
@@ -44,12 +47,19 @@ def write_rerun(path: str | Path, replay: Replay) -> None:
     cameras = replay.drive.frames[0].sample.cameras
     recording.send_blueprint(_blueprint(cameras))
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    # Coordinates of a map grid have errors of up to 4 m in float32.
+    origin = np.round(replay.drive.frames[0].sample.global_from_frame[:3, 3])
+    x, y, z = origin.astype(np.int64).tolist()
+    text = f"The origin of the recording is x {x}, y {y}, z {z} m in the global frame."
+    recording.log(_ORIGIN, rr.TextDocument(text), static=True)
     with atomic_write(path, "wb") as file:
         # A moment is one frame with the part of the map that the drive has explored so far.
         for moment in replay.moments():
             sample = moment.frame.sample
             recording.set_time(TIMELINE, timestamp=np.datetime64(sample.timestamp_ns, "ns"))
-            recording.log(_VEHICLE, _transform(rr, sample.global_from_frame))
+            pose = sample.global_from_frame.copy()
+            pose[:3, 3] -= origin
+            recording.log(_VEHICLE, _transform(rr, pose))
             for camera in sample.cameras:
                 _log_camera(recording, rr, camera=camera, data_root=replay.data_root)
             _log_predictions(recording, rr, moment=moment, colours=replay.colours)
@@ -57,7 +67,7 @@ def write_rerun(path: str | Path, replay: Replay) -> None:
             lines = []
             for label, line in moment.map_lines:
                 labels.append(label)
-                lines.append(line)
+                lines.append(line - origin)
             rgb = _rgb(labels, replay.colours)
             recording.log(_MAP, rr.LineStrips3D(lines, colors=rgb, radii=0.1))
             file.write(stream.read(flush=True))  # after each frame, to limit the memory
