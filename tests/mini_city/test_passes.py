@@ -1,5 +1,6 @@
 """Several passes of the same streets, of which some are repainted before the last one."""
 
+import argparse
 import hashlib
 import json
 from pathlib import Path
@@ -7,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from nuscenes.map_expansion.map_api import NuScenesMap
 from nuscenes.nuscenes import NuScenes
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
+from mapdata.nuscenes.map import open_map
+from minicity import devkit_plots
 from minicity.config import MiniCityConfig
 from minicity.generate import _splits, generate, plan_scenes
 from minicity.map_expansion import town_to_map
@@ -169,6 +173,31 @@ def test_annotations_of_each_pass_follow_the_paint_of_its_time(root: Path) -> No
                 assert shapely.distance(dividers, shapely.points(points)).max() < 0.15  # tilt
                 checked += 1
     assert checked > 10
+
+
+@pytest.mark.skipif(
+    np.lib.NumpyVersion(np.__version__) >= "2.4.0",
+    reason="nuscenes-devkit 1.2.0 draws maps with numpy < 2.4 alone (docs/install.md)",
+)
+def test_a_drawn_map_has_the_paint_of_its_time(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = []
+
+    def open_named(folder: Path, name: str) -> NuScenesMap:
+        opened.append(name)
+        return open_map(folder, name)
+
+    monkeypatch.setattr(devkit_plots, "open_map", open_named)
+    nusc = NuScenes("v1.0-trainval", str(root), verbose=False)
+    locations = []
+    for sample in nusc.sample:
+        scene = nusc.get("scene", sample["scene_token"])
+        locations.append(nusc.get("log", scene["log_token"])["location"])
+    of_town = [number for number, location in enumerate(locations) if location == VAL_TOWN]
+    for number in (of_town[0], of_town[-1]):
+        devkit_plots.run(argparse.Namespace(root=str(root), out=tmp_path, sample=number))
+    assert opened == [f"{VAL_TOWN}.before", VAL_TOWN]
 
 
 def test_a_share_of_the_streets_is_repainted(towns: tuple[Town, Town, list[Change]]) -> None:

@@ -15,6 +15,7 @@ from shapely import get_parts
 from shapely.geometry import MultiPolygon, Polygon
 
 from gsmap.utils.errors import InputError
+from mapdata.nuscenes.map import open_map
 from minicity.config import VERSION
 
 LAYERS = ["drivable_area", "road_segment", "lane", "ped_crossing", "walkway"]
@@ -50,7 +51,6 @@ def run(arguments: argparse.Namespace) -> str:
         )
     # Imported after the check above, since the devkit is slow to import.
     from nuscenes import NuScenes
-    from nuscenes.map_expansion.map_api import NuScenesMap
 
     mpl.use("Agg")  # writes files and opens no window
     repair_descartes()
@@ -68,7 +68,8 @@ def run(arguments: argparse.Namespace) -> str:
     # Position of the vehicle in the town, in metres, at the time of the LiDAR sweep.
     x, y, _ = nusc.get("ego_pose", lidar["ego_pose_token"])["translation"]
     patch = (x - RADIUS_M, y - RADIUS_M, x + RADIUS_M, y + RADIUS_M)
-    town = NuScenesMap(arguments.root, log["location"])
+    # Logs of the time before streets are repainted name the map of that time.
+    town = open_map(Path(arguments.root), log.get("map_expansion", log["location"]))
     figure, _ = town.render_map_patch(patch, LAYERS, figsize=(10, 10))
     figure.savefig(out / "map.png")
     return f"sample.png, lidar.png, map.png: {out}"

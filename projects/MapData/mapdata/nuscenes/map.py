@@ -143,7 +143,7 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
         area_names |= set(SURFACE_LAYERS)
     # Errors about the content get the name of the file and this advice.
     with explain_errors(path, "unpack the map expansion pack (v1.3) again"):
-        nusc_map = _open_map(root, name)
+        nusc_map = open_map(root, name)
         polygons = {}
         for area in sorted(area_names):
             polygons[area] = _read_polygons(nusc_map, area, skipped=skipped)
@@ -166,10 +166,14 @@ def maps_in(root: Path) -> list[str]:
     return sorted(path.stem for path in files if not is_hidden(path))
 
 
-def _open_map(root: Path, name: str) -> "NuScenesMap":
+def open_map(root: Path, name: str) -> "NuScenesMap":
     """Open a map with the devkit.
 
     The devkit only accepts the locations in its list, so the name is in the list while it opens.
+
+    Args:
+        root: Folder of the data set.
+        name: Name of the map's file below ``maps/expansion``, without its suffix.
     """
     from nuscenes.map_expansion.map_api import NuScenesMap, locations
 
