@@ -10,7 +10,7 @@ import pytest
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.source import Mount, change_frame
-from gsmap.utils.shards import Shard
+from gsmap.utils.shards import Shard, find_shards
 from mapdata.custom import from_records
 from mapdata.folders.images import read_image_folder
 
@@ -112,6 +112,17 @@ def test_the_sizes_and_poses_of_a_shard_are_those_of_all_records(drive: Path) ->
             for camera, other in zip(sample.cameras, wanted.cameras, strict=True):
                 np.testing.assert_array_equal(camera.cam_from_frame, other.cam_from_frame)
                 assert (camera.width, camera.height) == (other.width, other.height) == (160, 90)
+
+
+@pytest.mark.parametrize("name", ["calibration.yaml", "poses.csv"])
+def test_shards_of_other_calibrations_are_not_joined(name: str, drive: Path) -> None:
+    file = drive / "calibration.yaml"
+    for index in range(2):
+        shard = Shard(index, 2)
+        from_records(drive / "a.arrow", records_of(drive), META, drive, shard, calibration=file)
+        (drive / name).write_text((drive / name).read_text() + "\n")
+    with pytest.raises(ValueError, match="differs in input"):
+        find_shards(drive / "a.arrow")
 
 
 def test_a_map_in_grid_coordinates_comes_into_the_frame(drive: Path) -> None:

@@ -162,6 +162,15 @@ def test_what_cannot_be_used_is_left_out_by_name(tmp_path):
     assert not list(tmp_path.rglob("images/log1/pcam_b0/1700000000000000.*"))
 
 
+def test_crosswalks_that_cross_themselves_are_counted(monkeypatch, tmp_path):
+    crossed = [[20.0, -6.0], [70.0, 6.0], [70.0, -6.0], [20.0, 6.0], [20.0, -6.0]]
+    monkeypatch.setattr(cases, "CROSSWALK", crossed)
+    cases.write_log(tmp_path)
+    text, file = convert(tmp_path)
+    assert "1 x map element without a valid geometry left out" in text
+    assert {item.label for item in file[0].instances} == {0, 2, 3}
+
+
 @pytest.mark.parametrize(
     ("table", "column", "values", "message"),
     [
@@ -267,6 +276,18 @@ def test_joined_shards_are_the_whole_file(tmp_path):
     assert scenes == [sample.scene for sample in whole]
     merge_annotations(path, find_shards(path))
     assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("name", ["logs/test_val/log1/map.arrow", "logs/test_val/log3"])
+def test_shards_of_other_logs_are_not_joined(name, tmp_path):
+    folder = cases.write_log(tmp_path)
+    for number in (2, 3):
+        shutil.copytree(folder, folder.with_name(f"log{number}"))
+    convert_py123d(Py123dOptions(tmp_path, split="test_val", shard=Shard(0, 2)))
+    (tmp_path / name).rename(tmp_path / "elsewhere")
+    convert_py123d(Py123dOptions(tmp_path, split="test_val", shard=Shard(1, 2)))
+    with pytest.raises(ValueError, match="differs in input"):
+        find_shards(tmp_path / "gsmap_py123d_test_val.arrow")
 
 
 def test_vehicles_of_other_heights_are_not_mixed(tmp_path):

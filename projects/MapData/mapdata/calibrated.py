@@ -15,9 +15,10 @@ from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.source import Mount, change_frame, ground_from_frame
 from gsmap.utils.errors import InputError
-from gsmap.utils.shards import WHOLE, Shard
-from mapdata.folders.calibration_file import read_vehicle
+from gsmap.utils.shards import WHOLE, Shard, digest
+from mapdata.folders.calibration_file import read_calibration, read_vehicle
 from mapdata.folders.rig import RigCamera, RigFrame, rig_samples
+from mapdata.paths import path_below
 
 _KEYS = {"name", "path", "timestamp_ns"}  # keys that a camera of a record may have
 _POSE = "global_from_frame"
@@ -106,6 +107,25 @@ def calibrated_records(
                 cameras.append(entry)
             completed["cameras"] = cameras
         yield completed
+
+
+def digest_of_calibration(file: Path) -> str:
+    """Digest of the content of a calibration file, and of the file of poses that it names.
+
+    A missing file does not count, because `calibrated_records` raises an error for it.
+
+    Raises:
+        ValueError: If the calibration file is malformed.
+    """
+    if not file.is_file():
+        return ""
+    content = digest(file)
+    with explain_errors(file, remedy="see docs/inference.md"):
+        poses = read_calibration(file).get("poses")
+        path = path_below(file.parent, str(poses), noun="poses")
+    if poses and path.is_file():
+        content += digest(path)
+    return content
 
 
 def _name_of(record: Any, number: int) -> Any:

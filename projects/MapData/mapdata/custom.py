@@ -27,7 +27,7 @@ from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name
 from gsmap.utils.shards import WHOLE, Shard, digest
-from mapdata.calibrated import calibrated_records
+from mapdata.calibrated import calibrated_records, digest_of_calibration
 from mapdata.folders.rig import RigCamera
 from mapdata.local_map import POLYGON, vertices_of
 from mapdata.paths import path_below
@@ -112,12 +112,14 @@ def from_records(
     source = ""
     if shard.count:
         # Shards can be joined only if they are parts of one list. `source` identifies the list by
-        # the tokens of all records.
+        # the tokens of all records, and by their calibration.
         records = list(records)
-        tokens = []
+        lines = []
         for record in records:
-            tokens.append(str(record.get("token") if isinstance(record, Mapping) else record))
-        source = hashlib.sha256("\n".join(tokens).encode()).hexdigest()
+            lines.append(str(record.get("token") if isinstance(record, Mapping) else record))
+        if calibration is not None:
+            lines.append(digest_of_calibration(Path(calibration)))
+        source = hashlib.sha256("\n".join(lines).encode()).hexdigest()
     if calibration is not None:
         records = calibrated_records(
             list(records), Path(calibration), meta=meta, root=Path(data_root), shard=shard

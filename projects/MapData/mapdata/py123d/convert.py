@@ -7,6 +7,7 @@ dictionary of one frame from which `mapdata.custom.create_samples` makes a sampl
 import argparse
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,13 @@ from gsmap.utils.files import file_name
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import add_shard_options
 from mapdata.argoverse2.samples import thin_out
-from mapdata.command_line import FileOptions, add_range_options, options_from, parse_rate
+from mapdata.command_line import (
+    FileOptions,
+    add_range_options,
+    fingerprint,
+    options_from,
+    parse_rate,
+)
 from mapdata.custom import create_samples
 from mapdata.py123d.log import REMEDY, SYNC, Log
 from mapdata.py123d.map import Map
@@ -95,6 +102,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
         frame="ego",
         split=options.split,
         ground_z_m=_ground_z_m(logs, options.ground_z_m),
+        source_fingerprint=_fingerprint(logs, options.root),
         options={"rate_hz": options.rate_hz},
     )
     with Progress(shard_logs, desc=f"py123d {options.split}", unit="logs") as progress:
@@ -156,6 +164,20 @@ def _ground_z_m(logs: Sequence[Log], given_m: float | None) -> float:
                 "give --ground-z."
             )
     return first.ground_z_m
+
+
+def _fingerprint(logs: Sequence[Log], root: Path) -> str:
+    """Digest of the names and sizes of the tables and maps of logs below ``root``."""
+    sizes = {}
+    for log in logs:
+        paths = sorted(log.folder.glob("*.arrow"))
+        with suppress(ValueError):  # `_all_records` leaves out this log, with the reason
+            path = log.map_file(root)  # None for a log without a map
+            if path is not None and path.is_file():
+                paths.append(path)
+        for path in paths:
+            sizes[f"{log.name}/{path.name}"] = path.stat().st_size
+    return fingerprint(sizes)
 
 
 def _all_records(

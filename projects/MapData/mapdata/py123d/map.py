@@ -8,6 +8,8 @@ import numpy as np
 import shapely
 
 from gsmap.datasets.errors import explain_errors
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.polylines import is_closed
 from gsmap.utils.errors import InputError
 from mapdata.arrow_tables import read_table
 from mapdata.local_map import LINE, POLYGON
@@ -83,7 +85,7 @@ class Map:
             return
         if line.shape[1] == 2:
             line = np.pad(line, ((0, 0), (0, 1)))  # adds the height 0
-        if len(line) < 2:
+        if not _is_valid(line, is_area=name in AREA_CLASSES):
             self.left_out += 1
             return
         self.lines.append(line)
@@ -105,6 +107,13 @@ class Map:
         # The tree returns indices in no fixed order.
         indices = np.sort(self._tree.query(square, predicate="intersects")).tolist()
         return [{"label": self.labels[i], "points": self.lines[i]} for i in indices]
+
+
+def _is_valid(line: np.ndarray, is_area: bool) -> bool:
+    """Whether a line has two vertices, and does not cross itself if it is the ring of an area."""
+    if is_area and is_closed(line):
+        return len(line) > 3 and shapely.Polygon(line).is_valid
+    return len(line) > 1
 
 
 def _vertices(wkb: bytes) -> np.ndarray:
