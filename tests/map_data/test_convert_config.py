@@ -210,6 +210,9 @@ def test_a_config_of_another_model_is_refused(tmp_path):
         converted(upstream_configs.maptr(model="MapTracker"), tmp_path)
     with pytest.raises(ValueError, match=r"data\.train\.type must be one of .* got 'Mine'"):
         converted(upstream_configs.maptr(dataset="Mine"), tmp_path)
+    start = upstream_configs.maptr().replace("type='ResNet'", "type='VoVNet', spec_name='V-19-dw'")
+    with pytest.raises(ValueError, match=r"^V-19-dw is not supported: .* must be V-19-eSE"):
+        converted(start.replace("out_indices=(3,)", "out_features=['stage5']"), tmp_path)
     bare = "model = dict(type='MapTR')\n"
     with pytest.raises(ValueError, match=r"None is not supported: model\.pts_bbox_head\.type"):
         converted(bare, tmp_path)
@@ -233,6 +236,33 @@ def test_a_part_that_ours_does_not_have_is_refused(ours, theirs, tmp_path):
         ValueError, match=rf"^{theirs} is not supported: \S+ must be one of .*{ours}"
     ):
         converted(text.replace(ours, theirs), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("backbone", "wanted"),
+    [
+        (
+            "type='VoVNet', spec_name='V-19-eSE', input_ch=3, out_features=['stage5'])",
+            {"type": "VoVNet", "depth": 19, "out_indices": (3,)},
+        ),
+        (
+            "type='SwinTransformer', embed_dims=96, init_cfg=None)",
+            {"type": "mmdet.SwinTransformer", "embed_dims": 96, "init_cfg": None},
+        ),
+        ("type='ResNet', depth=18)", {"type": "mmdet.ResNet", "depth": 18}),
+    ],
+)
+@pytest.mark.parametrize("pretrained", ["", "pretrained=None,", "pretrained=dict(img='a.pth'),"])
+def test_another_backbone_has_no_settings_of_ours(backbone, wanted, pretrained, tmp_path):
+    text = upstream_configs.maptr()
+    start = text.index("    pretrained=")
+    stop = text.index("    img_neck=")
+    text = f"{text[:start]}{pretrained} img_backbone=dict({backbone},\n{text[stop:]}"
+    cfg, _ = converted(text, tmp_path)
+    if "img" in pretrained:
+        wanted = {**wanted, "init_cfg": {"type": "Pretrained", "checkpoint": "a.pth"}}
+    assert cfg.model.img_backbone == wanted
+    MODELS.build(cfg.model.img_backbone)
 
 
 def test_maptr_on_depth_pooled_features_stays_maptr(tmp_path):

@@ -324,17 +324,39 @@ def _image_settings(fields: Fields) -> dict[str, Any]:
     # The base configs augment images with GridMask in training. None switches this off.
     if not fields.take("model.use_grid_mask", default=False):
         settings["model.img_augment"] = None
+    # A part replaces the part of the base config, whose settings may not fit its type.
     for part in ("img_backbone", "img_neck"):
         values = fields.take(f"model.{part}", default={})
-        # Other backbones and necks are classes of mmdet. GSMap registers VoVNet itself.
-        if values["type"] != "VoVNet":
+        if values["type"] == "VoVNet":
+            values = _vovnet_settings(values)  # GSMap registers it itself
+        else:
             values["type"] = f"mmdet.{values['type']}"
-        for name, value in values.items():
-            settings[f"model.{part}.{name}"] = value
-    checkpoint = fields.take("model.pretrained", default={}).get("img")
+        settings[f"model.{part}"] = values
+    checkpoint = (fields.take("model.pretrained", default=None) or {}).get("img")
     if checkpoint is not None:
-        settings["model.img_backbone.init_cfg.checkpoint"] = checkpoint
+        weights = {"type": "Pretrained", "checkpoint": checkpoint}
+        settings["model.img_backbone"]["init_cfg"] = weights
     return settings
+
+
+def _vovnet_settings(values: dict[str, Any]) -> dict[str, Any]:
+    """Convert the settings of the original VoVNet, such as ``spec_name="V-99-eSE"``.
+
+    Raises:
+        ValueError: If the network is of another kind.
+    """
+    spec_name = values.pop("spec_name")
+    stages = values.pop("out_features")
+    size = re.fullmatch(r"V-(\d\d)-eSE", spec_name)
+    if not size:
+        raise InputError(
+            f"{spec_name!s:.60} is not supported: model.img_backbone.spec_name must be V-19-eSE, "
+            "V-39-eSE, V-57-eSE or V-99-eSE."
+        )
+    values.pop("input_ch", None)  # always 3
+    # The original counts the stem as stage 1.
+    out_indices = tuple(int(stage.removeprefix("stage")) - 2 for stage in stages)
+    return {**values, "depth": int(size[1]), "out_indices": out_indices}
 
 
 def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[float, ...]) -> str:
