@@ -101,7 +101,10 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         )
         notes += rig_notes
     else:
-        calibrated_cameras, ground = read_rig(calibration, options.vehicle_ground_z_m)
+        calibrated_cameras, ground, calibration_notes = read_rig(
+            calibration, options.vehicle_ground_z_m
+        )
+        notes += calibration_notes
         topics = _topics_of(calibrated_cameras, options=options, kinds=kinds)
         content = read_content(bag, topics)
         for name, camera_topic_pair in topics.items():
@@ -228,26 +231,22 @@ def _topics_of(
                 f"give {name}={topic}"
             )
         by_hand[name] = topic
-    images = by_hand or image_topics(kinds)
     topics = {}
     for camera, images_setting in calibrated_cameras:
         if camera.name in by_hand:
             topic = by_hand[camera.name]
         else:
-            topic = _topic_of(camera.name, images_setting, images=images, kinds=kinds)
+            topic = _topic_of(camera.name, images_setting, kinds=kinds)
         topics[camera.name] = (topic, "")
     return topics
 
 
-def _topic_of(
-    name: str, images_setting: str, images: Mapping[str, str], kinds: Mapping[str, str]
-) -> str:
+def _topic_of(name: str, images_setting: str, kinds: Mapping[str, str]) -> str:
     """Find the topic of a calibrated camera's images by its calibration, or else by its name.
 
     Args:
         name: Name of the camera.
         images_setting: Setting ``images`` of the camera in the calibration file. It may be a topic.
-        images: Topics of images, by the name of the camera.
         kinds: Type of the messages, by topic.
     """
     if kinds.get(images_setting) in IMAGES:
@@ -257,6 +256,7 @@ def _topic_of(
             f"camera {name!r} of the calibration: `images` is {images_setting}, which is "
             f"{kinds.get(images_setting, 'not there')}, and must be {' or '.join(IMAGES)}"
         )
+    images = image_topics(kinds)
     topic = images.get(name)
     if topic is None:
         raise InputError(

@@ -278,6 +278,12 @@ def test_topics_beside_a_calibration_file_are_used_or_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             read(given)
+    by_name = camera | {"images": "front"}  # the topic of the camera's name
+    content = {"cameras": {"one": camera, "two": by_name}, "rate_hz": 5, "poses": "poses.csv"}
+    file.write_text(json.dumps(content))
+    source = read({"one": (topics["one"], "")})
+    assert {camera.name for camera in source.samples[0].cameras} == set(greys)
+    assert "calibration.json: poses, rate_hz not used, since" in "; ".join(source.notes)
     for topic, message in (("/nowhere", "not there"), ("/one/camera_info", ".*CameraInfo")):
         file.write_text(json.dumps({"cameras": {"one": camera | {"images": topic}}}))
         with pytest.raises(ValueError, match=f"'one' .*is {topic}, which is {message}, and must"):

@@ -23,6 +23,7 @@ from mapdata.paths import path_below
 NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
 # Keys of a file and of each of its cameras, which docs/inference.md describes.
 _KEYS = {"cameras", "ground_z_m", "poses", "rate_hz", "max_time_difference_ms"}
+_BAG_VALUES = ("poses", "rate_hz", "max_time_difference_ms")  # keys that a bag replaces
 _CAMERA_KEYS = {
     "images", "intrinsics", "distortion", "distortion_model", "vehicle_from_camera", "position_m",
     "quaternion_wxyz", "yaw_pitch_roll_deg", "size_px",
@@ -36,8 +37,8 @@ _MOST_VALUES = 100_000  # largest number of values in a file
 
 def read_rig(
     file: Path, ground_z_m: float | None
-) -> tuple[list[tuple[RigCamera, str]], np.ndarray]:
-    """Read the cameras of a calibration file for images that lie elsewhere, such as in a bag.
+) -> tuple[list[tuple[RigCamera, str]], np.ndarray, list[str]]:
+    """Read the cameras of a calibration file for the images of a bag.
 
     Args:
         file: Calibration file, in which each camera has ``size_px``.
@@ -46,7 +47,8 @@ def read_rig(
 
     Returns:
         The cameras, each with the value of its key ``images`` (the topic in a bag, empty without
-        the key), and the pose of the road in the vehicle's frame. (4, 4)
+        the key); the pose of the road in the vehicle's frame (4, 4); and a note if there are keys
+        that have no effect.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -71,7 +73,12 @@ def read_rig(
                     raise InputError("a camera of a bag needs size_px: [width, height]")
                 rig_camera = create_camera(name, camera, ground=ground, images=())
                 rig.append((rig_camera, str(camera.get("images", ""))))
-        return rig, ground
+        unused_keys = [name for name in _BAG_VALUES if name in content]
+        notes = []
+        if unused_keys:
+            names = ", ".join(unused_keys)
+            notes.append(f"{file.name}: {names} not used, since poses and times are the bag's")
+        return rig, ground, notes
 
 
 def read_vehicle(
