@@ -90,6 +90,8 @@ def assert_same_elements(found: MapSample, wanted: MapSample) -> None:
 
 def test_maptr_infos_get_their_truth_from_the_maps(known, minicity_root, tmp_path):
     infos = {"infos": [nuscenes_info(s) for s in known], "metadata": {"version": "v1.0-trainval"}}
+    last = infos["infos"][-1]
+    last["ego2global_rotation"] = Quaternion(last["ego2global_rotation"]).rotation_matrix
     file = convert(tmp_path, "nuscenes_infos_temporal_train.pkl", infos, minicity_root)
     assert file.meta == replace(
         file.meta, dataset="nuscenes", frame="lidar", split="train", command="make it"
@@ -149,7 +151,7 @@ def test_elements_that_cannot_be_used_are_counted(known, damaged_root, tmp_path)
 
 def test_argoverse_infos_keep_three_coordinates(tmp_path):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    lines = [np.array([[0.0, 0, 1], [5, 0, 2]])]
+    lines = [[], [[1.0, 2]], np.array([[0.0, 0, 1], [5, 0, 2]])]
     camera = {
         "img_fpath": "data/argoverse2/sensor/val/log/sensors/cameras/ring_front_center/7.jpg",
         "intrinsics": np.diag([100.0, 100, 1]),
@@ -172,7 +174,7 @@ def test_argoverse_infos_keep_three_coordinates(tmp_path):
     assert (file.meta.dataset, file.meta.frame, file.meta.dim) == ("av2", "ego", 3)
     assert (file.meta.x_range, file.meta.y_range) == ((-30, 30), (-15, 15))
     assert len(sample.instances) == 1
-    np.testing.assert_allclose(sample.instances[0].points, lines[0])
+    np.testing.assert_allclose(sample.instances[0].points, lines[-1])
     assert sample.cameras[0].path == "val/log/sensors/cameras/ring_front_center/7.jpg"
     assert (sample.cameras[0].width, sample.cameras[0].height) == (1550, 2048)
     # the vehicle has moved 1 m along the city's x, which is -y of the vehicle, when the image is

@@ -182,7 +182,9 @@ def _nuscenes_sample(
         # vehicle, as MapTR does when it loads the file.
         measurements = np.asarray(can_bus, np.float64)[7:16]
         can_bus = pose_signals(global_from_ego)
-        can_bus[3:7] = np.asarray(info["ego2global_rotation"])
+        quaternion = np.asarray(info["ego2global_rotation"], np.float64)
+        if quaternion.shape == (4,):  # otherwise a matrix; the file's quaternion keeps its sign
+            can_bus[3:7] = quaternion
         can_bus[7 : 7 + len(measurements)] = measurements
     return MapSample(
         token=info["token"],
@@ -361,7 +363,8 @@ def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
 def _dim(entries: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> int:
     """Number of coordinates per point of the first map element, at most 3; 2 without elements.
 
-    All elements of a file are assumed to have equal numbers of coordinates.
+    All elements of a file are assumed to have equal numbers of coordinates. Lines of fewer than two
+    points do not count, since they are left out.
     """
     for info in entries:
         annotation = info.get("annotation")
@@ -369,7 +372,8 @@ def _dim(entries: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> int:
             continue
         for name in classes:
             for points in annotation[name]:
-                return min(np.shape(points)[-1], 3)
+                if len(points) >= 2:
+                    return min(np.shape(points)[-1], 3)
     return 2
 
 
