@@ -127,6 +127,15 @@ def test_files_that_are_no_images_are_counted(tmp_path):
     assert source.notes[0] == "camera 'front': 2 files with ['.tif', '.txt'] not read"
 
 
+@pytest.mark.parametrize("name", ["front[1].png", "[a].png", "a[!b].png", "1.png"])
+def test_brackets_in_the_name_of_one_image_are_letters(name, tmp_path):
+    drive = folder_of(tmp_path / "drive", {"front": [name, "f.png"]})
+    camera = LEVEL | {"images": f"front/{name}"}
+    (drive / "calibration.json").write_text(json.dumps({"cameras": {"front": camera}}))
+    (sample,) = open_input(drive).samples
+    assert sample.cameras[0].path == f"front/{name}"
+
+
 def test_images_without_a_partner_are_counted(tmp_path):
     names = {"front": ["0.png", "1.png", "2.png"], "left": ["1.png", "2.png", "x.png", "y.png"]}
     source = open_input(folder_of(tmp_path / "drive", names))

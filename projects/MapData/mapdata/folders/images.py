@@ -159,8 +159,12 @@ def _find_images(
     pattern = str(camera.get("images", name))
     # A path that leads out of the folder is an error.
     place = path_below(folder, pattern, noun="images")
-    # The pattern of a single file is its name.
-    candidates = place.iterdir() if place.is_dir() else folder.glob(_simplify_pattern(pattern))
+    if place.is_dir():
+        candidates = place.iterdir()
+    elif place.is_file():  # its name may have brackets, which mean something in a pattern
+        candidates = iter([place])
+    else:
+        candidates = folder.glob(_simplify_pattern(pattern))
     images = []
     other_suffixes = set()
     other_count = 0
