@@ -9,6 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from report_case import FRAMES, STRANGE, write_case
 
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.visualization import film
 from gsmap.visualization.style import track_colours
 
@@ -70,6 +71,10 @@ def test_a_scene_that_does_not_exist_is_named_with_one_that_does(tmp_path):
         film.write_drive_film(tmp_path / "no.mp4", annotations, results, scene="scene-0003")
     with pytest.raises(ValueError, match="results must name at least one result file"):
         film.write_drive_film(tmp_path / "no.mp4", annotations, {})
+    write_annotations(annotations, AnnotationFile(annotations).meta, [])
+    for scene in (None, STRANGE):
+        with pytest.raises(ValueError, match="has no samples to show"):
+            film.write_drive_film(tmp_path / "no.mp4", annotations, results, scene=scene)
     assert not (tmp_path / "no.mp4").exists()
 
 

@@ -121,6 +121,8 @@ def write_drive_film(
         raise InputError(f"score_thr must be in [0, 1], got {score_thr}.")
     file = AnnotationFile(annotations)
     scenes = list(dict.fromkeys(file.column("scene")))  # without repetition, in their order
+    if not scenes:
+        raise InputError(f"{annotations} has no samples to show.")
     scene = scenes[0] if scene is None else scene
     if scene not in scenes:
         raise InputError(
