@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -159,10 +159,11 @@ def _find_images(
     pattern = str(camera.get("images", name))
     # A path that leads out of the folder is an error.
     place = path_below(folder, pattern, noun="images")
+    candidates: Iterable[Path]
     if place.is_dir():
         candidates = place.iterdir()
     elif place.is_file():  # its name may have brackets, which mean something in a pattern
-        candidates = iter([place])
+        candidates = [place]
     else:
         candidates = folder.glob(_simplify_pattern(pattern))
     images = []
