@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -323,6 +324,11 @@ def test_local_positions_that_contradict_the_origin_are_refused(tmp_path, place)
         assert found.points.tolist() == [[0, 0], [0, 11]]
     with pytest.raises(ValueError, match=r"local_y of a node lie \d+ m from its lat"):
         read_map(path, CLASSES, place)
+    for value in ("", "0", "0.0"):  # as programs write a map without a place
+        nodes = re.sub("(lat|lon)='.*?'", rf"\1='{value}'", NODES)
+        path.write_text(osm(way(10, [1, 2], type="line_thin"), nodes))
+        found, _ = read_map(path, CLASSES, place)
+        assert found.points.tolist() == [[0, 0], [0, 11]]
 
 
 LAUGHS = "".join(f"<!ENTITY l{i} '{f'&l{i - 1};' * 10}'>" for i in range(1, 10))

@@ -283,7 +283,7 @@ class _Parser:
     def _node(self, node_id: str, attributes: Mapping[str, str]) -> _Node:
         """Check the position of a node."""
         degrees = None
-        if "lat" in attributes or "lon" in attributes:
+        if attributes.get("lat") or attributes.get("lon"):  # empty in maps with local positions
             latitude = self._number(attributes.get("lat", ""), node_id)
             longitude = self._number(attributes.get("lon", ""), node_id)
             if abs(latitude) > 90 or abs(longitude) > 180:
@@ -347,7 +347,8 @@ class _Parser:
         """
         for references in lines:
             for node in self._nodes(references):
-                if node.degrees is None or node.local is None:
+                has_place = node.degrees not in (None, (0.0, 0.0))  # zeros stand for no place
+                if not has_place or node.local is None:
                     continue
                 (point,) = origin.points_of(np.array([node.degrees]), where=str(self._path))
                 distance_m = float(np.linalg.norm(point - node.local))
