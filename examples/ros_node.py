@@ -28,8 +28,10 @@ CAMERAS = {"CAM_FRONT": "/front", "CAM_BACK": "/rear"}
 VEHICLE = "base_footprint"  # x ahead, y left, on the road below the rear axle
 MIN_SCORE = 0.3
 PERIOD_S = 0.5
-# Encodings of images that the node takes, and the channels of red, green and blue in them.
-ENCODINGS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
+# Encodings of images that the node takes, and the slice of the channels red, green and blue.
+RGB = slice(0, 3)
+BGR = slice(2, None, -1)
+ENCODINGS = {"rgb8": RGB, "bgr8": BGR, "rgba8": RGB, "bgra8": BGR}
 # RGB of the classes divider, ped_crossing and boundary, in the order of the model's labels.
 COLOURS = [(0.2, 0.6, 1.0), (1.0, 0.6, 0.1), (0.2, 0.8, 0.3)]
 

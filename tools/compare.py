@@ -185,7 +185,7 @@ def slurm_commands(runs: list[Run], partition: str) -> str:
     """Commands for the unfinished runs, one per line: this command with ``--only`` for each run.
 
     Args:
-        runs: All runs of the comparison.
+        runs: Chosen runs of the comparison.
         partition: Partition of the Slurm cluster.
     """
     # A parser with the single option --slurm returns all other words of this command line.
@@ -264,13 +264,13 @@ def main() -> str:
             options=(*options, *args.cfg_options),
         )
         runs = plan([parse_entry(text) for text in args.configs], protocol)
-    if args.slurm:
-        return slurm_commands(runs, args.slurm)
     # Without --only, `args.only` is None, and all runs are chosen.
     chosen = [run for run in runs if args.only in (None, run.label)]
     if args.only and not chosen:
         labels = [run.label for run in runs]
         raise InputError(f"no run has the name {args.only}; there are {labels}.")
+    if args.slurm:
+        return slurm_commands(chosen, args.slurm)
     if not args.rescore:
         train(chosen)
     tables = "" if args.only else tabulate(runs, args)

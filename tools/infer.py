@@ -327,9 +327,10 @@ def run_settings(args: argparse.Namespace) -> dict[str, str]:
     """Settings of the command that determine the predictions of a sample, by name."""
     checkpoint = chosen_checkpoint(args)
     settings = {"model": args.model[0], "checkpoint": digest(checkpoint)}
-    names = ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp", "update_prior")
-    for name in names:
+    for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp"):
         settings[name] = str(getattr(args, name))
+    if args.update_prior:
+        settings["update_prior"] = "True"
     for path in args.prior:
         settings[f"prior {path.resolve()}"] = digest(path) if path.exists() else "new"
     return settings

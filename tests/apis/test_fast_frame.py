@@ -2,6 +2,7 @@
 
 import copy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ from inferencer_cases import NAMES, make_config, make_remembering, make_samples
 from mmdet.models.backbones import ResNet
 from mmengine.dataset import pseudo_collate
 
-from gsmap.apis.fast_frame import FastFrames, StaticFrame, reason_against
+from gsmap.apis.fast_frame import FastFrames, StaticFrame, _Recording, reason_against
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
 from gsmap.models.encoders.fused_resnet import convolve_folded, fused_resnet
-from gsmap.structures.tensors import matrix_products
+from gsmap.structures.tensors import matrix_products, tensor_versions
 
 REPO = Path(__file__).resolve().parents[2]
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -50,6 +51,33 @@ def test_a_missing_field_of_a_sample_is_named(inferencer, tmp_path):
     batch["data_samples"][0].set_metainfo({"lidar2img": None})
     with pytest.raises(ValueError, match="has no 'lidar2img' in its metainfo"):
         frames(batch)
+
+
+def test_a_recording_is_made_again_after_a_training(inferencer, tmp_path, monkeypatch):
+    """Its graph reads copies of the backbone, which a training deletes."""
+    model = copy.deepcopy(inferencer.model)
+    frames = FastFrames(StaticFrame(model), torch.device("cpu"))
+    recorded = []
+
+    def record(self, key, inputs):
+        recorded.append(key)
+        self._graphs[key] = _Recording(
+            graph=SimpleNamespace(replay=lambda: None),
+            inputs=[tensor.clone() for tensor in inputs],
+            output=self.frame(*inputs),
+            versions=tensor_versions(model),
+            copies=model.backbone_copies(),
+        )
+        return self._graphs[key]
+
+    monkeypatch.setattr(FastFrames, "_record", record)
+    batch = batch_of(inferencer, tmp_path)
+    for number in (1, 2):
+        for _ in range(2):
+            frames(copy.deepcopy(batch))
+        assert len(recorded) == number
+        model.train()
+        model.eval()
 
 
 def test_matrix_products_are_in_tf32_for_a_while():

@@ -1,5 +1,6 @@
 """A small MapTR with random weights on generated samples."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -241,6 +242,21 @@ def test_rigs_may_take_turns_and_leave_the_model_as_it_is(inferencer, tmp_path):
     assert inferencer.model.bev_encoder.cams_embeds is embeds
     for name, value in inferencer.model.state_dict().items():
         assert torch.equal(value, weights[name])
+
+
+def test_embeddings_of_a_rig_follow_a_training_and_a_copy_predicts_as_well(inferencer, tmp_path):
+    model = copy.deepcopy(inferencer)  # also its locks
+    samples = make_samples(tmp_path, 1)
+    front, back = samples[0].cameras
+    samples[0].cameras = [replace(back, name="rear"), replace(front, name="windscreen")]
+    (before,) = model(samples, tmp_path)
+    embeds = model.model.bev_encoder.cams_embeds
+    embeds.grad = torch.rand_like(embeds)
+    torch.optim.AdamW([embeds], lr=1.0, fused=True).step()  # leaves its version as it is
+    (after,) = model(samples, tmp_path)
+    assert not torch.equal(before.pred_instances_3d.pts, after.pred_instances_3d.pts)
+    (kept,) = inferencer(samples, tmp_path)
+    assert torch.equal(before.pred_instances_3d.pts, kept.pred_instances_3d.pts)
 
 
 def test_samples_of_another_frame_are_seen_from_the_model_s(inferencer, tmp_path):

@@ -40,7 +40,7 @@ LINE = '{"sample_token":"t0","vectors":[{"pts":%s,"cls_name":"%s","confidence_le
         [HEAD, '{"sample_token":1,"vectors":[]}'],
         [HEAD, '{"sample_token":["t0"],"vectors":[]}'],
         [HEAD, '{"sample_token":"t0","vectors":[1]}'],
-        [HEAD, '{"sample_token":"t0","broken":"no image"}'],
+        [HEAD, '{"sample_token":"t0","broken":2}'],
         [HEAD, '{"sample_token":"t0","vectors":[{}]}'],
         [HEAD, LINE % ("[[0,0],[NaN,1]]", "divider", "0.5")],
         [HEAD, LINE % ("[[0,0],[1,1]]", "divider", "7")],
@@ -70,6 +70,17 @@ def test_elements_of_a_class_of_the_run_are_taken_up(tmp_path):
         assert log.done == {"t0"}
         log.finish({})
     assert json.loads(out.read_text())["results"] == [json.loads(line)]
+
+
+def test_a_frame_that_an_earlier_version_has_noted_as_broken_is_tried_again(tmp_path):
+    out = tmp_path / "map.json"
+    noted = '{"sample_token":"t0","broken":"no image"}'
+    (tmp_path / "map.json.unfinished").write_text(f"{HEAD}\n{noted}\n")
+    with ResultLog(out, {"model": "a"}, ["t0", "t1"], ["divider"]) as log:
+        assert log.done == set()
+        log.add("t0", [])
+        assert log.finish({}) == 1
+    assert json.loads(out.read_text())["results"] == [json.loads(FRAME)]
 
 
 def test_frames_of_other_settings_are_counted(tmp_path):

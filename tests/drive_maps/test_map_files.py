@@ -316,19 +316,19 @@ def test_nodes_without_local_positions_need_an_origin(tmp_path):
 
 
 @pytest.mark.parametrize("place", [MapOrigin(48.261, 11.67), GRID])
-def test_local_positions_that_contradict_the_origin_are_refused(tmp_path, place):
+def test_degrees_that_contradict_local_positions_are_counted(tmp_path, place):
     path = tmp_path / "town.osm"
     path.write_text(osm(way(10, [1, 2], type="line_thin")))
-    for origin in (None, ORIGIN):  # as the positions
-        found, _ = read_map(path, CLASSES, origin)
+    for origin, counted in ((None, 0), (ORIGIN, 0), (place, 1), (MapOrigin(-33.0, 151.0), 1)):
+        found, unused = read_map(path, CLASSES, origin)
         assert found.points.tolist() == [[0, 0], [0, 11]]
-    with pytest.raises(ValueError, match=r"local_y of a node lie \d+ m from its lat"):
-        read_map(path, CLASSES, place)
+        assert sum("m from local_x and local_y" in reason for reason in unused) == counted
     for value in ("", "0", "0.0"):  # as programs write a map without a place
         nodes = re.sub("(lat|lon)='.*?'", rf"\1='{value}'", NODES)
         path.write_text(osm(way(10, [1, 2], type="line_thin"), nodes))
-        found, _ = read_map(path, CLASSES, place)
+        found, unused = read_map(path, CLASSES, place)
         assert found.points.tolist() == [[0, 0], [0, 11]]
+        assert not unused
 
 
 LAUGHS = "".join(f"<!ENTITY l{i} '{f'&l{i - 1};' * 10}'>" for i in range(1, 10))

@@ -211,8 +211,11 @@ def test_a_config_of_another_model_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"data\.train\.type must be one of .* got 'Mine'"):
         converted(upstream_configs.maptr(dataset="Mine"), tmp_path)
     start = upstream_configs.maptr().replace("type='ResNet'", "type='VoVNet', spec_name='V-19-dw'")
-    with pytest.raises(ValueError, match=r"^V-19-dw is not supported: .* must be V-19-eSE"):
+    with pytest.raises(ValueError, match=r"of V-19-dw with .*'stage5'.* must be V-19-eSE"):
         converted(start.replace("out_indices=(3,)", "out_features=['stage5']"), tmp_path)
+    stem = start.replace("-dw", "-eSE").replace("out_indices=(3,)", "out_features=['stem']")
+    with pytest.raises(ValueError, match=r"\['stem'\] is not supported: .* some of stage2, "):
+        converted(stem, tmp_path)
     bare = "model = dict(type='MapTR')\n"
     with pytest.raises(ValueError, match=r"None is not supported: model\.pts_bbox_head\.type"):
         converted(bare, tmp_path)

@@ -194,7 +194,9 @@ def test_a_line_of_two_lanes_is_one_line(tmp_path: Path):
     onward = np.array([[20, 1], [25, 1], [28, 2.0]])
     ring = np.array([[8, -4], [11, -4], [11, 4], [8, -4.0]])
     turned = ring[[1, 2, 0, 1]]
-    copies = [line, line[::-1], line + 1e-9, onward, onward, ring, ring[::-1], turned]
+    dense = np.array([[0, 0], [5, 0], [10, 0], [20, 1.0]])
+    copies = [line, line[::-1], line + 1e-9, line + np.array([4e-4, -3e-4]), dense[::-1]]
+    copies += [onward, onward, ring, ring[::-1], turned]
     pieces = []
     for points in copies:
         pieces.append({"label": 0, "points": points})

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from argoverse2_road import write_log
+from nuscenes.utils.splits import create_splits_scenes
 from sample_cases import META, pose, sample
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
@@ -145,6 +146,10 @@ def test_each_of_several_versions_has_a_list(damaged_root: Path, tmp_path: Path)
         file = AnnotationFile(root / f"gsmap_nuscenes_{part}.arrow")
         assert {s.scene for s in file} == wanted
         assert file.meta.split_list == ""
+    # A list may give scenes of the official list to another part.
+    official = create_splits_scenes()["test"][0]
+    lists["v1.0-trainval"]["val"] = [official]
+    (root / "v1.0-trainval/splits.json").write_text(json.dumps(lists["v1.0-trainval"]))
     (root / "v1.0-test/splits.json").unlink()  # the official list has other scenes
     assert f"{len(names)} of the {len(names) + 150} scenes" in convert_nuscenes(options).text()
     (root / "v1.0-test").rename(root / "own")

@@ -189,7 +189,7 @@ def test_only_runs_with_one_partner_are_paired(runs, expected, without_pair, tmp
     folders = [str(tmp_path / number) for number in without_pair]
     assert json.loads(as_json(results, "", ""))["without_pair"] == folders
     text = markdown(results, "", "")
-    assert ("In no pair" in text) == bool(folders)
+    assert ("Runs without a pair" in text) == bool(folders)
     assert ", ".join(folders) in text
 
 

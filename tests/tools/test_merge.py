@@ -232,6 +232,22 @@ def test_forged_matches_are_refused(scored, tmp_path):
         merge([str(target)])
 
 
+def test_matches_without_numbers_of_notes_are_joined(scored, tmp_path):
+    """Earlier versions wrote the numbers into the texts."""
+    target = tmp_path / "metrics.json"
+    evaluate([*map(str, scored), "--eval", "chamfer", "--out", str(target), "--shard", "0/1"])
+    path = tmp_path / "metrics.00000-of-00001.json"
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files if name != "note_numbers"}
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    manifest = json.loads(path.with_name(f"{path.name}.manifest").read_text())
+    manifest |= {"sha256": digest(path), "bytes": path.stat().st_size}
+    path.with_name(f"{path.name}.manifest").write_text(json.dumps(manifest))
+    merge([str(target)])
+    assert 0 < json.loads(target.read_text())["chamfer/mAP"] < 1
+
+
 def test_figures_of_results_that_lie_in_shards(predictions, minicity_annotations, tmp_path):
     for path in predictions.parent.glob("map.*-of-*"):
         shutil.copy(path, tmp_path)

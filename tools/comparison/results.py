@@ -375,8 +375,8 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
     without_pair = folders_without_pair(results)
     if without_pair:
         parts.append(
-            "In no pair, as the seed is unknown, of several runs of the config, or of no run of "
-            f"the other: {', '.join(without_pair)}."
+            "Runs without a pair, because their seed is unknown, is used by several runs of the "
+            f"config, or is missing in the other config: {', '.join(without_pair)}."
         )
     parts += [
         "Cost. Peak memory is the largest process's, or the GPU's.",

@@ -94,8 +94,8 @@ def read_lanelet2(
     A line string gets its class from the tag ``class``, or else from its type (`CLASS_OF_TYPE`). A
     lanelet of the subtype ``crosswalk`` is an area of the class ``ped_crossing``. Positions are
     ``local_x`` and ``local_y`` if all used nodes have them, and otherwise longitude and latitude.
-    Both must agree with the origin, if nodes have both and there is one. Other line strings and
-    relations are only counted.
+    Other line strings and relations are only counted, and so are degrees that contradict the local
+    positions.
 
     Args:
         path: File, which may be untrusted. A file with a document type declaration is refused,
@@ -110,8 +110,8 @@ def read_lanelet2(
     Raises:
         FileNotFoundError: If the file does not exist.
         ValueError: If the file is malformed or too large, a number is not finite or out of range,
-            a node or a bound of a crosswalk is missing, degrees have no origin or contradict local
-            positions, or no element can be used.
+            a node or a bound of a crosswalk is missing, degrees have no origin, or no element can
+            be used.
         RuntimeError: If an origin is given and ``pyproj`` is missing.
     """
     path = Path(path)
@@ -145,8 +145,8 @@ def read_lanelet2(
             f"{path} has nodes without local_x and local_y, and the origin of the global frame is "
             "not known: give --origin or --crs."
         )
-    if is_local and origin is not None:
-        parser.require_origin(origin, [nodes for _, nodes in lines])
+    if is_local:
+        collector.unused.update(parser.contradictions(origin, [nodes for _, nodes in lines]))
     for class_name, nodes in lines:
         collector.add(class_name, parser.positions(nodes, is_local=is_local))
     # With the origin, `finish` converts degrees to metres. Without it, lines are in metres already.
@@ -332,33 +332,37 @@ class _Parser:
                     return False
         return True
 
-    def require_origin(self, origin: MapOrigin | MapGrid, lines: Sequence[Sequence[str]]) -> None:
-        """Check that local positions are metres from an origin.
+    def contradictions(
+        self, origin: MapOrigin | MapGrid | None, lines: Sequence[Sequence[str]]
+    ) -> list[str]:
+        """Compare the local position of a node with its longitude and latitude.
 
-        The first node with degrees is checked. Nodes of Autoware have positions in a square of the
+        The first node with degrees is compared. Nodes of Autoware have positions in a square of the
         military grid, which is another frame.
 
         Args:
-            origin: Position of the global frame on the Earth.
+            origin: Position of the global frame on the Earth; None if it is not known.
             lines: IDs of the nodes of each line. All nodes have local positions.
 
-        Raises:
-            ValueError: If a node is farther than 10 m from its longitude and latitude.
+        Returns:
+            A description if the degrees lie farther than 10 m from the local position.
         """
+        if origin is None:
+            return []
         for references in lines:
             for node in self._nodes(references):
                 has_place = node.degrees not in (None, (0.0, 0.0))  # zeros stand for no place
                 if not has_place or node.local is None:
                     continue
-                (point,) = origin.points_of(np.array([node.degrees]), where=str(self._path))
-                distance_m = float(np.linalg.norm(point - node.local))
+                try:
+                    (point,) = origin.points_of(np.array([node.degrees]), where=str(self._path))
+                    distance_m = float(np.linalg.norm(point - node.local))
+                except InputError:  # farther than a place reaches
+                    distance_m = math.inf
                 if distance_m > _MOST_APART_M:
-                    raise InputError(
-                        f"{self._path}: local_x and local_y of a node lie {distance_m:.0f} m from "
-                        "its lat and lon in the global frame: correct --origin or --crs, leave it "
-                        "out to use local_x and local_y, or remove these tags to use lat and lon."
-                    )
-                return
+                    return [f"longitude and latitude, {distance_m:.0f} m from local_x and local_y"]
+                return []
+        return []
 
     def positions(self, references: Sequence[str], is_local: bool) -> FloatArray:
         """Return the positions of nodes.

@@ -412,7 +412,7 @@ def odometry_poses(
     Args:
         odometries: All odometries of a bag.
         tree: Frames of the bag.
-        vehicle: Name of the vehicle's frame; empty if the bag has no transforms.
+        vehicle: Name of the vehicle's frame; empty if it is unknown.
         ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
 
     Returns:

@@ -21,7 +21,7 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size, read_image
-from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.classes import LINE_CLASSES
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.errors import InputError
@@ -50,6 +50,7 @@ _ALL_ELEMENTS_LOST = (
     "%d of %d records lose all of their elements (the first is %r), as none lies in x_range and "
     "y_range: points must be in metres of the frame, not of the world, and not in millimetres."
 )
+_COPY_M = 0.01  # largest distance of two copies of a line
 _SAME_PLACE_M = 0.1  # ends of lines within this distance are one place
 _GLOBAL = "global_instances"
 _KEYS = sorted([*(field.name for field in fields(MapSample)), _GLOBAL])
@@ -76,8 +77,8 @@ def from_records(
       docs/inference.md) the image is rectified into ``rectified/`` of the data root;
     - ``instances``: mappings with ``label`` (name or index) and ``points`` (n, 2 or 3) in metres.
       The first and the last point of a ring are equal. Elements are clipped to the range of
-      ``meta``; rings of areas stay rings. Without this key and the next one, the sample has no
-      ground truth;
+      ``meta``; rings stay rings, but those of dividers, boundaries and centre lines are cut open.
+      Without this key and the next one, the sample has no ground truth;
     - ``global_instances``: elements in the global frame in place of ``instances``, such as a whole
       map. They are transformed to the frame by the position and the yaw of ``global_from_frame``
       or, in annotation files with heights, by the whole pose;
@@ -222,15 +223,19 @@ def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
 
 
 def _without_copies(lines: Sequence[Points]) -> list[Points]:
-    """Lines that differ from all earlier ones by a millimetre or more. (n, dim) each
+    """Lines that are not within 1 cm of an earlier one in the plane all along. (n, dim) each
 
     The direction of a line does not count, nor does the start of a ring.
     """
-    first_of: dict[shapely.Geometry, Points] = {}
-    for line in lines:
-        rounded = line.round(3) + 0.0  # the sum turns -0.0 into 0.0, which has another hash
-        first_of.setdefault(shapely.normalize(shapely.LineString(rounded)), line)
-    return list(first_of.values())
+    shapes = np.array([shapely.LineString(line[:, :2]) for line in lines], dtype=object)
+    bounds = shapely.bounds(shapes)  # (lines, 4)
+    is_kept = np.zeros(len(lines), dtype=np.bool_)
+    for index, shape in enumerate(shapes):
+        # Copies have nearly equal bounding boxes, which are fast to compare.
+        is_near = (np.abs(bounds - bounds[index]) <= _COPY_M).all(axis=1) & is_kept
+        distances = shapely.hausdorff_distance(shapes[is_near], shape)
+        is_kept[index] = not (distances <= _COPY_M).any()
+    return [lines[index] for index in np.flatnonzero(is_kept)]
 
 
 def _snap_ends(lines: Sequence[Points]) -> None:
@@ -376,13 +381,13 @@ def _class_index(label: Any, meta: AnnotationMeta) -> int:
 def _clip(points: Points, label: int, meta: AnnotationMeta) -> list[Points]:
     """Clip an element to the range of an annotation file. (n, dim) each
 
-    Rings of areas stay rings. Other rings that leave the range are cut into open lines, so that the
-    border of the range is not part of the ground truth.
+    Rings stay rings, such as areas of the user's classes. Rings of lines that leave the range are
+    cut into open lines, so that the border of the range is not part of the ground truth.
     """
     low, high = np.array([meta.x_range, meta.y_range]).T
     if ((points[:, :2] >= low) & (points[:, :2] <= high)).all():
         return [points]
-    if meta.classes[label] not in AREA_CLASSES or not is_closed(points):
+    if meta.classes[label] in LINE_CLASSES or not is_closed(points):
         return list(clip_to_box(points, x_range=meta.x_range, y_range=meta.y_range))
     polygon = shapely.Polygon(points)
     if not polygon.is_valid:

@@ -163,12 +163,21 @@ class _Recording:
         output: Tensor that the graph writes.
         versions: Address and version of each weight and buffer of the model at the time of the
             recording (`tensor_versions`). A change in place raises the version.
+        copies: Copies of the backbone that the graph reads (`MapDetector.backbone_copies`).
     """
 
     graph: Any
     inputs: list[Tensor]
     output: Tensor
     versions: list[tuple[int, int]]
+    copies: list[Any]
+
+    def is_up_to_date(self, model: Any) -> bool:
+        """Whether the graph reads the present weights of a model."""
+        copies = model.backbone_copies()
+        # Copies are made again after a training. They are not compared by their values.
+        are_equal = list(map(id, copies)) == list(map(id, self.copies))
+        return are_equal and tensor_versions(model) == self.versions
 
 
 @dataclass
@@ -275,7 +284,7 @@ class FastFrames:
             recording.graph.replay()
             # While the GPU computes, compare the versions of the weights with their versions at the
             # time of the recording. If a weight has changed, drop this result and record again.
-            if tensor_versions(self.frame.model) == recording.versions:
+            if recording.is_up_to_date(self.frame.model):
                 self._graphs.move_to_end(key)
                 return recording.output.cpu()  # a copy, as the next replay overwrites the output
             del self._graphs[key]
@@ -311,9 +320,12 @@ class FastFrames:
                     f"a frame could not be captured as a CUDA graph ({error!s:.300}): run the "
                     f"model without CUDA graphs ({SWITCH}=False, --no-{SWITCH.replace('_', '-')})."
                 ) from error
-        versions = tensor_versions(self.frame.model)
         self._graphs[key] = _Recording(
-            graph=graph, inputs=buffers, output=output, versions=versions
+            graph=graph,
+            inputs=buffers,
+            output=output,
+            versions=tensor_versions(self.frame.model),
+            copies=self.frame.model.backbone_copies(),
         )
         return self._graphs[key]
 

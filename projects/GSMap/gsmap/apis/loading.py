@@ -13,7 +13,6 @@ from mmengine.config import Config
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.named_models import named_models
 from gsmap.checkpoints.reading import Checkpoint, adopt_settings, load_weights, read_checked
-from gsmap.checkpoints.settings import single_dataset_of
 from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.source import Mount
 from gsmap.engine.launch import read_config
@@ -61,7 +60,6 @@ def load_model(
             another architecture, or if its settings or its mount are not valid.
     """
     cfg = read_config(config, cfg_options)
-    single_dataset_of(cfg, part="test", purpose="inference")
     if checkpoint is None and str(config) in named_models():
         checkpoint = str(config)
     # The file is read once, and the functions below share its contents.

@@ -29,6 +29,7 @@ from gsmap.apis.live_map import LiveMap
 from gsmap.apis.loading import load_model
 from gsmap.apis.map_priors import maps_for
 from gsmap.checkpoints.building import building
+from gsmap.checkpoints.settings import single_dataset_of
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.elements import elements_of_predictions
@@ -147,6 +148,7 @@ class MapInferencer:
     ):
         self.model = load_model(config, checkpoint=checkpoint, cfg_options=cfg_options)
         self.cfg: Config = self.model.cfg
+        single_dataset_of(self.cfg, part="test", purpose="inference")
         # True until the user has been warned about a model that was trained on generated images.
         self._warn_generated = self.model.training_dataset == _GENERATED
         self.amp = amp
@@ -164,13 +166,20 @@ class MapInferencer:
             self._fast_frames.append(fast_frames)
         # A step changes state of the replica for the time of the step: memory, prior, embeddings.
         self._locks = [threading.Lock() for _ in self.replicas]
-        # Embeddings of other rigs by replica, rows (`camera_rows`), and address and version of the
-        # trained ones. They are kept because `FastFrames` records frames again if a weight moves.
+        # Embeddings of other rigs by replica and rows (`camera_rows`). They are kept because
+        # `FastFrames` records frames again if a weight moves.
         self._rig_embeds: dict[Any, torch.nn.Parameter] = {}
         self.visualizer = _build_visualizer(self.cfg)
         # Folder of the annotation files that `dataset` writes, and the number of these files.
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
         self._num_files = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_locks": None}  # locks cannot be copied
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._locks = [threading.Lock() for _ in self.replicas]
 
     def _build_fast_frames(
         self, model: Any, device: torch.device, cuda_graphs: bool | None
@@ -297,11 +306,12 @@ class MapInferencer:
             yield
             return
         trained = encoder.cams_embeds
-        version = 0 if trained.is_inference() else trained._version
-        key = (turn, tuple(rows), trained.data_ptr(), version)
-        if key not in self._rig_embeds:
-            self._rig_embeds[key] = torch.nn.Parameter(trained.detach()[rows])  # (V, C)
-        encoder.cams_embeds = self._rig_embeds[key]
+        values = trained.detach()[rows]  # (V, C)
+        key = (turn, tuple(rows))
+        embeds = self._rig_embeds.get(key)
+        if embeds is None or not torch.equal(embeds, values):  # the model may have been trained
+            embeds = self._rig_embeds[key] = torch.nn.Parameter(values)
+        encoder.cams_embeds = embeds
         try:
             yield
         finally:

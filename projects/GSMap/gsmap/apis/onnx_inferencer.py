@@ -234,7 +234,7 @@ class OnnxInferencer:
                 )
         stacked = np.stack(list(map(np.asarray, images)))  # (V, H, W, 3)
         for name, array in {"images": stacked, **inputs}.items():
-            if not np.isfinite(array).all():
+            if np.issubdtype(array.dtype, np.inexact) and not np.isfinite(array).all():
                 raise InputError(
                     f"{name} of {self.path.name} must be finite: the sample has NaN or infinity in "
                     "it, or in a matrix from which it is computed."

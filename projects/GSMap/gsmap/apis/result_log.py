@@ -91,7 +91,8 @@ class ResultLog:
             frame = _parse_line(line)
             is_valid = self._is_frame(frame, same_settings=same_settings)
             self._require(is_valid, line_number=line_number)
-            self.done.add(frame["sample_token"])
+            if "broken" not in frame:  # a line of an earlier version for a frame to try again
+                self.done.add(frame["sample_token"])
             end += len(line)
         if not same_settings:
             self.dropped = len(self.done)
@@ -118,6 +119,8 @@ class ResultLog:
             return False
         if same_settings and self._tokens is not None and token not in self._tokens:
             return False
+        if "broken" in frame:
+            return isinstance(frame["broken"], str)
         return self._are_elements(frame.get("vectors"), same_settings=same_settings)
 
     def _are_elements(self, vectors: Any, same_settings: bool) -> bool:
@@ -177,8 +180,9 @@ class ResultLog:
             file.readline()  # the settings
             position = file.tell()
             for line in file:
-                token = json.loads(line)["sample_token"]
-                positions.append((token, position))
+                frame = json.loads(line)
+                if "broken" not in frame:
+                    positions.append((frame["sample_token"], position))
                 position += len(line)
             positions.sort()
 

@@ -120,7 +120,8 @@ def dataset_of(cfg: Config, part: str) -> ConfigDict:
     """
     dataset = (cfg.get(f"{part}_dataloader") or {}).get("dataset")
     if not dataset:
-        raise InputError(f"{cfg.filename} has no {part}_dataloader.dataset, which is needed here.")
+        name = cfg.filename or "the config"
+        raise InputError(f"{name} has no {part}_dataloader.dataset, which is needed here.")
     return dataset
 
 
@@ -138,8 +139,8 @@ def single_dataset_of(cfg: Config, part: str, purpose: str) -> ConfigDict:
     dataset = dataset_of(cfg, part)
     if wrapped_datasets(dataset):
         raise InputError(
-            f"{purpose}: {part}_dataloader.dataset of {cfg.filename} is a {dataset.type} of other "
-            "data sets: name one of these instead."
+            f"{purpose}: {part}_dataloader.dataset of {cfg.filename or 'the config'} is a "
+            f"{dataset.type} of other data sets: name one of these instead."
         )
     return dataset
 

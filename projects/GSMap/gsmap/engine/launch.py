@@ -118,7 +118,7 @@ def _set_data_root(cfg: Config, data_root: str) -> None:
         if dataset:
             datasets += innermost_datasets(dataset)
     if not datasets:
-        raise InputError(f"--data-root: {cfg.filename} has no data set.")
+        raise InputError(f"--data-root: {cfg.filename or 'the config'} has no data set.")
     for innermost_dataset in datasets:
         innermost_dataset.data_root = data_root
 

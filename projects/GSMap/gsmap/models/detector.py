@@ -174,6 +174,15 @@ class MapDetector(Base3DDetector):
         if self.half_backbone is not None:
             self.half_backbone.backbone = None
 
+    def backbone_copies(self) -> list[Any]:
+        """Copies of backbone and neck that inference runs at present; None if there is none."""
+        copies: list[Any] = []
+        if self.folded_backbone is not None:
+            copies.append(self.folded_backbone.folded)
+        if self.half_backbone is not None:
+            copies += [self.half_backbone.backbone, self.half_backbone.neck]
+        return copies
+
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
         """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
         if self.img_backbone is None:

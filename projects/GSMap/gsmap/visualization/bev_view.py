@@ -360,12 +360,13 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     """
     elements = panel.elements
     _draw_background(ax, panel.points, grid=grid, view=view, style=style)
-    ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5)
+    # Names may contain dollar signs, which matplotlib would read as formulas.
+    ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5, parse_math=False)
     _draw_vehicle(ax, view)
     _draw_truth(ax, panel, view=view, style=style)
     if not elements:  # None, or no elements
         note = ax.text(0.5, 0.03, panel.note, transform=ax.transAxes, ha="center", va="bottom")
-        note.set(fontsize=7, color=style.muted)
+        note.set(fontsize=7, color=style.muted, parse_math=False)
         return
     lines = [view.display_from_frame(line) for line in elements.polylines]
     colours = _element_colours(panel, elements.labels, style=style)

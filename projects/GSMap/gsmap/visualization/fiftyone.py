@@ -4,7 +4,6 @@ import argparse
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -198,11 +197,9 @@ def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[flo
     shares = np.clip(segments / size_px, 0.0, 1.0).round(_DECIMALS)  # (m, 2, 2)
     # A part ends where the next visible segment is not the next segment of the line, or where the
     # line is outside of the image between the two.
-    breaks = []
-    for position, (before, after) in enumerate(pairwise(index), start=1):
-        is_joined = np.allclose(segments[position - 1, 1], segments[position, 0])
-        if after != before + 1 or not is_joined:
-            breaks.append(position)
+    are_next = np.diff(index) == 1
+    are_joined = np.isclose(segments[:-1, 1], segments[1:, 0]).all(-1)
+    breaks = np.flatnonzero(~(are_next & are_joined)) + 1
     parts = []
     for run in np.split(shares, breaks):
         # The points are the start of each segment, and the end of the last one.

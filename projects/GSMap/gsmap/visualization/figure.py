@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -183,10 +182,12 @@ def _draw_header(figure: Figure, title: str, lines: Sequence[Line2D], style: Map
     margin = _MARGIN / width
     if len(title) > _LONGEST_TITLE:
         title = title[: _LONGEST_TITLE - 1] + "\N{HORIZONTAL ELLIPSIS}"
-    figure.text(margin, 1 - 0.3 * _HEADER / height, title, size=9, color=style.ink, va="center")
+    # Names may contain dollar signs, which matplotlib would read as formulas.
+    heading = figure.text(margin, 1 - 0.3 * _HEADER / height, title, size=9, va="center")
+    heading.set(color=style.ink, parse_math=False)
     # A handle and the gap after an entry take about as much space as five letters.
     num_letters = sum(len(str(line.get_label())) + 5 for line in lines)
-    figure.legend(
+    legend = figure.legend(
         handles=lines,
         loc="center left",
         bbox_to_anchor=(margin, 1 - 0.75 * _HEADER / height),
@@ -199,9 +200,10 @@ def _draw_header(figure: Figure, title: str, lines: Sequence[Line2D], style: Map
         handlelength=1.4,
         columnspacing=1.4,
     )
+    for text in legend.get_texts():
+        text.set_parse_math(False)
 
 
-@rc_context({"text.parse_math": False})  # names may contain dollar signs
 def compose_figure(
     cameras: Sequence[CameraView],
     panels: Sequence[BEVPanel],

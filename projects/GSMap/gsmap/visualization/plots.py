@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -37,7 +36,6 @@ def panel_grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-@rc_context({"text.parse_math": False})  # names may contain dollar signs
 def finish_panel(
     ax: Axes,
     title: str,
@@ -57,7 +55,8 @@ def finish_panel(
         legend: Options of the legend, such as its location. There is a legend only if the data have
             labels.
     """
-    ax.set_title(title, fontsize=9, loc="left", color=colour)
+    # Names may contain dollar signs, which matplotlib would read as formulas.
+    ax.set_title(title, fontsize=9, loc="left", color=colour, parse_math=False)
     ax.set_xlabel(x_label, fontsize=8)
     ax.set_ylabel(y_label, fontsize=8)
     ax.tick_params(labelsize=7.5)
@@ -65,9 +64,11 @@ def finish_panel(
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(
+        shown_legend = ax.legend(
             fontsize=7.5, frameon=False, handlelength=1.4, borderaxespad=0.2, **(legend or {})
         )
+        for text in shown_legend.get_texts():
+            text.set_parse_math(False)
 
 
 def finish_shares(ax: Axes, title: str, x_label: str, y_label: str, colour: str = "black") -> None:

@@ -127,21 +127,28 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
     if published_or_file is not None:
         return published_or_file, published_or_file.identity
     official = create_splits_scenes()
+    # Scenes by part. A splits.json may list scenes of all versions, also in another part than the
+    # official list.
     scenes: dict[str, list[str]] = {}
-    has_own_list = False
+    listed: set[str] = set()
     for version_name in options.versions:
         splits_path = options.root / version_name / "splits.json"
         if splits_path.is_file():
-            has_own_list = True
-            parts = read_split_file(splits_path).scenes
-        elif version_name in _OFFICIAL_SPLITS:
-            parts = {part: official[part] for part in _OFFICIAL_SPLITS[version_name]}
-        else:
+            for part, names in read_split_file(splits_path).scenes.items():
+                scenes.setdefault(part, []).extend(names)
+                listed.update(names)
+    has_own_list = bool(scenes)
+    for version_name in options.versions:
+        splits_path = options.root / version_name / "splits.json"
+        if splits_path.is_file():
+            continue
+        if version_name not in _OFFICIAL_SPLITS:
             raise InputError(
                 f"version {version_name!r} has no official splits: give --split-file, or write "
                 f"{splits_path} (docs/data.md says how)."
             )
-        for part, names in parts.items():
+        for part in _OFFICIAL_SPLITS[version_name]:
+            names = [name for name in official[part] if name not in listed]
             scenes.setdefault(part, []).extend(names)
     if has_own_list:
         return SplitList("splits", scenes), ""

@@ -327,6 +327,9 @@ def _image_settings(fields: Fields) -> dict[str, Any]:
     # A part replaces the part of the base config, whose settings may not fit its type.
     for part in ("img_backbone", "img_neck"):
         values = fields.take(f"model.{part}", default={})
+        for name in values:
+            if not str(name).isidentifier():
+                raise InputError(f"model.{part} has {name!s:.60}, which is no name of a setting")
         if values["type"] == "VoVNet":
             values = _vovnet_settings(values)  # GSMap registers it itself
         else:
@@ -339,23 +342,29 @@ def _image_settings(fields: Fields) -> dict[str, Any]:
     return settings
 
 
+# Output index of each stage of VoVNet. The original counts the stem as stage 1.
+_VOVNET_STAGES = {"stage2": 0, "stage3": 1, "stage4": 2, "stage5": 3}
+
+
 def _vovnet_settings(values: dict[str, Any]) -> dict[str, Any]:
     """Convert the settings of the original VoVNet, such as ``spec_name="V-99-eSE"``.
 
     Raises:
         ValueError: If the network is of another kind.
     """
-    spec_name = values.pop("spec_name")
-    stages = values.pop("out_features")
+    if "spec_name" not in values:  # settings of GSMap's VoVNet
+        return values
+    spec_name = str(values.pop("spec_name"))
+    stages = values.pop("out_features", ())
     size = re.fullmatch(r"V-(\d\d)-eSE", spec_name)
-    if not size:
+    if not size or not set(stages) <= _VOVNET_STAGES.keys():
         raise InputError(
-            f"{spec_name!s:.60} is not supported: model.img_backbone.spec_name must be V-19-eSE, "
-            "V-39-eSE, V-57-eSE or V-99-eSE."
+            f"model.img_backbone of {spec_name:.60} with out_features {stages!s:.60} is not "
+            "supported: spec_name must be V-19-eSE, V-39-eSE, V-57-eSE or V-99-eSE, and "
+            f"out_features some of {', '.join(_VOVNET_STAGES)}."
         )
     values.pop("input_ch", None)  # always 3
-    # The original counts the stem as stage 1.
-    out_indices = tuple(int(stage.removeprefix("stage")) - 2 for stage in stages)
+    out_indices = tuple(_VOVNET_STAGES[stage] for stage in stages)
     return {**values, "depth": int(size[1]), "out_indices": out_indices}
 
 

@@ -117,7 +117,8 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
             rules, so the manifest of the first one is enough.
 
     Returns:
-        Reports of all metrics, and the notes of all shards, with the sums of their numbers.
+        Reports of all metrics, and the notes of all shards. Numbers of elements are added up, and
+        notes on samples and on the range are those of each shard.
 
     Raises:
         ValueError: If a manifest contains no rules, or the matches of a shard do not fit the rules.
@@ -136,7 +137,9 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
             with np.load(shard.path) as file:
                 arrays = dict(file)  # reads all arrays before the file is closed
             texts = arrays.pop("notes").tolist()
-            notes += zip(arrays.pop("note_numbers").tolist(), texts, strict=True)
+            # Shards of earlier versions have the numbers in the texts.
+            numbers = arrays.pop("note_numbers", np.zeros(len(texts), dtype=np.int64))
+            notes += zip(numbers.tolist(), texts, strict=True)
             if arrays:  # the shard has samples
                 matches += _split_samples(arrays, evaluator)
         except (*_FAULTS, *DAMAGED_ZIP) as error:
