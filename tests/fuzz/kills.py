@@ -41,7 +41,10 @@ def run(work: Work, kill_after_s: float = LIMIT_S) -> tuple[int, str]:
         os.kill(pid, signal.SIGKILL)
         found = os.waitpid(pid, 0)
     status = os.waitstatus_to_exitcode(found[1])
-    said += _read(terminal)
+    # Its workers end soon after it, and until then hold its files. The terminal ends with the last.
+    os.set_blocking(terminal, True)
+    while more := _read(terminal):
+        said += more
     os.close(terminal)
     return status, said.decode(errors="replace")
 
