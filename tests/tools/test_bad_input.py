@@ -45,7 +45,7 @@ infer: VAL --model base.py K --out out.json | base.py cannot be used: FileNotFou
 infer: VAL --model scope.py K --out out.json | scope.py cannot be used: ValueError: 'gsmap::' is not read in _base_; write a path below
 infer: VAL --model bytes.py K --out out.json | bytes.py cannot be used: UnicodeDecodeError
 infer: VAL --model plain.txt K --out out.json | plain.txt cannot be used: OSError: Only py
-infer: VAL --model empty.py K --out out.json | empty.py has no test_dataloader.dataset
+infer: VAL --model empty.py K --out out.json | empty.py: a setting is missing:
 infer: VAL --model C --out out.json | give a checkpoint after
 infer: VAL --model C nowhere.pth --out out.json | There is no checkpoint nowhere.pth
 infer: VAL --model C damaged.pth --out out.json | damaged.pth was not loaded: it is broken
