@@ -252,7 +252,9 @@ def test_embeddings_of_a_rig_follow_a_training_and_a_copy_predicts_as_well(infer
     (before,) = model(samples, tmp_path)
     embeds = model.model.bev_encoder.cams_embeds
     embeds.grad = torch.rand_like(embeds)
+    model.model.train()
     torch.optim.AdamW([embeds], lr=1.0, fused=True).step()  # leaves its version as it is
+    model.model.eval()
     (after,) = model(samples, tmp_path)
     assert not torch.equal(before.pred_instances_3d.pts, after.pred_instances_3d.pts)
     (kept,) = inferencer(samples, tmp_path)

@@ -322,7 +322,7 @@ def test_degrees_that_contradict_local_positions_are_counted(tmp_path, place):
     for origin, counted in ((None, 0), (ORIGIN, 0), (place, 1), (MapOrigin(-33.0, 151.0), 1)):
         found, unused = read_map(path, CLASSES, origin)
         assert found.points.tolist() == [[0, 0], [0, 11]]
-        assert sum("m from local_x and local_y" in reason for reason in unused) == counted
+        assert sum("far from local_x and local_y" in reason for reason in unused) == counted
     for value in ("", "0", "0.0"):  # as programs write a map without a place
         nodes = re.sub("(lat|lon)='.*?'", rf"\1='{value}'", NODES)
         path.write_text(osm(way(10, [1, 2], type="line_thin"), nodes))

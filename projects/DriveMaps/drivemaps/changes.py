@@ -135,7 +135,7 @@ def _are_in_view(elements: MapElements, passes: list[Pass]) -> BoolArray:
     share = np.zeros(num_elements)  # part of each element that is in view, in the best pass
     for views in views_of_passes(points, passes):
         num_in_view = np.bincount(owners, views >= MIN_VIEWS, minlength=num_elements)
-        share = np.maximum(share, num_in_view / num_points)
+        share = np.maximum(share, num_in_view / np.maximum(num_points, 1))
     is_area = np.array([name in AREA_CLASSES for name in passes[0].drive.classes])
     return np.where(is_area[elements.labels], share >= MIN_SHARE_IN_VIEW, share > 0.0)
 

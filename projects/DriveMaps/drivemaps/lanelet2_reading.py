@@ -356,12 +356,10 @@ class _Parser:
                     continue
                 try:
                     (point,) = origin.points_of(np.array([node.degrees]), where=str(self._path))
-                    distance_m = float(np.linalg.norm(point - node.local))
-                except InputError:  # farther than a place reaches
-                    distance_m = math.inf
-                if distance_m > _MOST_APART_M:
-                    return [f"longitude and latitude, {distance_m:.0f} m from local_x and local_y"]
-                return []
+                    is_near = float(np.linalg.norm(point - node.local)) <= _MOST_APART_M
+                except InputError:  # farther from the origin than a place reaches
+                    is_near = False
+                return [] if is_near else ["longitude and latitude far from local_x and local_y"]
         return []
 
     def positions(self, references: Sequence[str], is_local: bool) -> FloatArray:

@@ -122,9 +122,9 @@ def digest_of_calibration(file: Path) -> str:
     content = digest(file)
     with explain_errors(file, remedy="see docs/inference.md"):
         poses = read_calibration(file).get("poses")
-        path = path_below(file.parent, str(poses), noun="poses")
-    if poses and path.is_file():
-        content += digest(path)
+        if poses:
+            path = path_below(file.parent, str(poses), noun="poses")
+            content += digest(path) if path.is_file() else ""
     return content
 
 

@@ -174,10 +174,11 @@ class _Recording:
 
     def is_up_to_date(self, model: Any) -> bool:
         """Whether the graph reads the present weights of a model."""
-        copies = model.backbone_copies()
-        # Copies are made again after a training. They are not compared by their values.
-        are_equal = list(map(id, copies)) == list(map(id, self.copies))
-        return are_equal and tensor_versions(model) == self.versions
+        # Copies are made again after a training.
+        for recorded, present in zip(self.copies, model.backbone_copies(), strict=True):
+            if recorded is not present:
+                return False
+        return tensor_versions(model) == self.versions
 
 
 @dataclass
@@ -274,7 +275,8 @@ class FastFrames:
             return self.frame(*on_device).cpu()
         # The recording of one rig stays while frames of another one are predicted.
         cams_embeds = getattr(self.frame.model.bev_encoder, "cams_embeds", None)
-        key = (id(cams_embeds), *((tensor.shape, tensor.dtype) for tensor in inputs))
+        sizes = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
+        key = (id(cams_embeds), sizes)
         while True:
             recording = self._graphs.get(key)
             if recording is None:

@@ -166,9 +166,10 @@ class MapInferencer:
             self._fast_frames.append(fast_frames)
         # A step changes state of the replica for the time of the step: memory, prior, embeddings.
         self._locks = [threading.Lock() for _ in self.replicas]
-        # Embeddings of other rigs by replica and rows (`camera_rows`). They are kept because
-        # `FastFrames` records frames again if a weight moves.
-        self._rig_embeds: dict[Any, torch.nn.Parameter] = {}
+        # Embeddings of other rigs by replica and rows (`camera_rows`), each with the state of the
+        # trained ones that it was made from. They are kept because `FastFrames` records frames
+        # again if a weight moves.
+        self._rig_embeds: dict[Any, tuple[Any, torch.nn.Parameter]] = {}
         self.visualizer = _build_visualizer(self.cfg)
         # Folder of the annotation files that `dataset` writes, and the number of these files.
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
@@ -301,17 +302,19 @@ class MapInferencer:
             turn: Index of the replica.
             rows: For each camera the index of the trained camera; None for the trained cameras.
         """
-        encoder = self.replicas[turn].bev_encoder
+        model = self.replicas[turn]
+        encoder = model.bev_encoder
         if rows is None or rows == list(range(len(encoder.cams_embeds))):
             yield
             return
         trained = encoder.cams_embeds
-        values = trained.detach()[rows]  # (V, C)
+        version = 0 if trained.is_inference() else trained._version
+        state = (trained.data_ptr(), version, model.num_trainings)
         key = (turn, tuple(rows))
-        embeds = self._rig_embeds.get(key)
-        if embeds is None or not torch.equal(embeds, values):  # the model may have been trained
-            embeds = self._rig_embeds[key] = torch.nn.Parameter(values)
-        encoder.cams_embeds = embeds
+        if key not in self._rig_embeds or self._rig_embeds[key][0] != state:
+            embeds = torch.nn.Parameter(trained.detach()[rows])  # (V, C)
+            self._rig_embeds[key] = (state, embeds)
+        _, encoder.cams_embeds = self._rig_embeds[key]
         try:
             yield
         finally:

@@ -94,9 +94,10 @@ def open_priors(
 
     require_prior(model)
     new_paths = [path for path in paths if update and not path.exists()]
+    known_paths = [path for path in paths if path not in new_paths]
     priors: dict[Path, AnyPrior] = {}
     # Files that are created come last, because the places of the others decide on theirs.
-    for path in sorted(paths, key=new_paths.__contains__):
+    for path in [*known_paths, *new_paths]:
         if path in new_paths:
             known_places = [prior.settings.place for prior in priors.values()]
             place = _new_place(new_paths, set(places).difference(known_places))

@@ -369,7 +369,9 @@ def _check_schedule(cfg: Config) -> None:
 
 
 def find_schedulers(cfg: Config) -> dict[str, ConfigDict]:
-    """Find the schedulers of a config, one or a list, or these of each of several optimizers.
+    """Find the schedulers of a config.
+
+    A config has one scheduler, a list of them, or one of both for each of several optimizers.
 
     Returns:
         Settings of each scheduler, by dotted name.
@@ -494,6 +496,7 @@ def has_trained_memory(cfg: Config) -> bool:
     model = cfg.get("model") or {}
     if _has_trained_stream_memory(model.get("temporal") or {}):
         return True
+    # A prior that reads a window of a raster map is written to in training, too.
     prior_class = class_of_type(kind=(model.get("prior") or {}).get("type"))
     return getattr(prior_class, "reads_window", False)
 

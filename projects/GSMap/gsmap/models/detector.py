@@ -138,6 +138,8 @@ class MapDetector(Base3DDetector):
         self.prior: Any = None
         if prior is not None:
             self.prior = MODELS.build({"head": self.map_head, "encoder": self.bev_encoder, **prior})
+        # Number of times that a training may have changed the weights without their versions.
+        self.num_trainings = 0
         self.step_graphs: StepGraphs | None = None
         if cuda_graphs:  # `SWITCH` is the name of this argument
             require_recordable(self)
@@ -169,6 +171,7 @@ class MapDetector(Base3DDetector):
         The copies are made again if the versions of the weights have changed, but a fused optimizer
         changes weights without their versions.
         """
+        self.num_trainings += 1
         if self.folded_backbone is not None:
             self.folded_backbone.folded = None
         if self.half_backbone is not None:

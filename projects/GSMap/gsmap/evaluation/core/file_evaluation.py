@@ -338,8 +338,11 @@ class SamplePairs:
             text = "some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)"
             notes.append((0, text))
         if self._degenerate:
-            text = "ground truths have fewer than two points: they count, but no prediction can "
-            notes.append((self._degenerate, text + "match them"))
+            text = (
+                "ground truths have fewer than two points: they count, but no prediction can match "
+                "them"
+            )
+            notes.append((self._degenerate, text))
         if canvas is not None:
             notes += [(0, note) for note in self._canvas_notes(canvas)]
         for name, number in sorted(ignored_predictions.items()):
