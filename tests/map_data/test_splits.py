@@ -151,7 +151,9 @@ def test_each_of_several_versions_has_a_list(damaged_root: Path, tmp_path: Path)
     lists["v1.0-trainval"]["val"] = [official]
     (root / "v1.0-trainval/splits.json").write_text(json.dumps(lists["v1.0-trainval"]))
     (root / "v1.0-test/splits.json").unlink()  # the official list has other scenes
-    assert f"{len(names)} of the {len(names) + 150} scenes" in convert_nuscenes(options).text()
+    text = convert_nuscenes(options).text()
+    assert f"{len(names)} of the {len(names) + 150} scenes" in text
+    assert f"in no part of the splits, such as '{last}'" in text
     (root / "v1.0-test").rename(root / "own")
     with pytest.raises(ValueError, match=r"'own' has no official splits: .*own/splits\.json"):
         convert_nuscenes(replace(options, version=("v1.0-trainval", "own")))

@@ -27,6 +27,7 @@ from gsmap.utils.files import is_hidden
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import SPLIT_LIST, list_identity
+from gsmap.utils.words import format_count
 from mapdata.command_line import (
     FileOptions,
     add_file_options,
@@ -131,21 +132,21 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
     # official list.
     scenes: dict[str, list[str]] = {}
     listed: set[str] = set()
+    versions_without_list = []
     for version_name in options.versions:
         splits_path = options.root / version_name / "splits.json"
-        if splits_path.is_file():
-            for part, names in read_split_file(splits_path).scenes.items():
-                scenes.setdefault(part, []).extend(names)
-                listed.update(names)
-    has_own_list = bool(scenes)
-    for version_name in options.versions:
-        splits_path = options.root / version_name / "splits.json"
-        if splits_path.is_file():
+        if not splits_path.is_file():
+            versions_without_list.append(version_name)
             continue
+        for part, names in read_split_file(splits_path).scenes.items():
+            scenes.setdefault(part, []).extend(names)
+            listed.update(names)
+    has_own_list = bool(scenes)
+    for version_name in versions_without_list:
         if version_name not in _OFFICIAL_SPLITS:
             raise InputError(
                 f"version {version_name!r} has no official splits: give --split-file, or write "
-                f"{splits_path} (docs/data.md says how)."
+                f"{options.root / version_name / 'splits.json'} (docs/data.md says how)."
             )
         for part in _OFFICIAL_SPLITS[version_name]:
             names = [name for name in official[part] if name not in listed]
@@ -164,7 +165,8 @@ def _resolve_splits(
     """Find the part of the split list, such as ``train``, to which each scene belongs.
 
     Returns:
-        Part by name of the scene, and a note if scenes of the list are missing in the data set.
+        Part by name of the scene, and notes if scenes of the list are missing in the data set, or
+        scenes of the data set in the list.
 
     Raises:
         ValueError: If a scene is in several parts, if no scene of the list is in the data set, or
@@ -187,6 +189,10 @@ def _resolve_splits(
         total = len(missing) + len(split_of)
         note = split_list.missing_note(missing, total, where=where, allowed=options.allow_missing)
         notes.append(note)
+    unlisted = sorted(set(names.values()) - split_of.keys())
+    if unlisted:
+        number = format_count(len(unlisted), "scene")
+        notes.append(f"{number} of {where} in no part of the splits, such as {unlisted[0]!r}")
     return split_of, notes
 
 
