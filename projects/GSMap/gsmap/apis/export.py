@@ -163,8 +163,7 @@ class ExportedDetector(nn.Module):
             recalled.further_hooks = further_hooks
             predictions = head(recalled.outputs, **recalled.hooks)
         last_layer = predictions[-1]
-        decoded = head.reference.decode(last_layer.references[0])
-        scores = head.coder.weigh_scores(last_layer.scores[0], decoded)
+        scores, decoded = head.decode(last_layer.scores[0], last_layer.references[0])
         best = head.coder.best(scores)
         fields = head.select_detections(decoded, best)
         elements = [best.scores, best.labels, fields["pts"]]

@@ -118,9 +118,8 @@ class StaticFrame(nn.Module):
             (M, F)
         """
         head = self.model.map_head
-        decoded = head.reference.decode(references)  # fields by name, with points in metres
-        # Some coders change the logits by the decoded geometry before the selection.
-        weighted_scores = head.coder.weigh_scores(scores, decoded)
+        # Fields by name, with points in metres. Some coders change the logits by the geometry.
+        weighted_scores, decoded = head.decode(scores, references)
         # `best` selects a fixed number of elements. Elements outside of the map are removed only
         # after the recorded operations (`_with_predictions`), because their number varies.
         best = head.coder.best(weighted_scores)

@@ -83,18 +83,26 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
         path: File of the checkpoint, for the error.
 
     Raises:
-        ValueError: If a setting has another type than in the run, or if an entry is not finite,
-            or has neither a single value nor the shape of its parameter.
+        ValueError: If the run trains another number of weights, if a setting has another type than
+            in the run, or if an entry is not finite, or has neither a single value nor the shape of
+            its parameter.
     """
-    # `zip` is not strict: torch itself refuses a state with other numbers of groups or parameters.
+    # `zip` is not strict: torch itself refuses a state with another number of groups.
     for group, run_group in zip(state["param_groups"], optimizer.param_groups, strict=False):
         # ``params`` has the numbers of the parameters. The other keys are settings.
         for name in run_group.keys() & (group.keys() - {"params"}):
             if not _is_compatible(group[name], reference=run_group[name]):
                 raise refusal(path, reason=f"its optimizer has {name} = {group[name]!r:.40}")
     # The state refers to parameters by number, in the order of the groups.
-    numbers = chain.from_iterable(group["params"] for group in state["param_groups"])
-    parameters = chain.from_iterable(group["params"] for group in optimizer.param_groups)
+    numbers = list(chain.from_iterable(group["params"] for group in state["param_groups"]))
+    parameters = list(chain.from_iterable(group["params"] for group in optimizer.param_groups))
+    has_equal_groups = len(state["param_groups"]) == len(optimizer.param_groups)
+    if has_equal_groups and len(numbers) != len(parameters):
+        reason = (
+            f"its optimizer has {len(numbers)} weights, and this run trains {len(parameters)} "
+            "(other parts may be frozen)"
+        )
+        raise refusal(path, reason=reason)
     for number, parameter in zip(numbers, parameters, strict=False):
         entries = state["state"].get(number, {})
         if not isinstance(entries, Mapping):

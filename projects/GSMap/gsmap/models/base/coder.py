@@ -226,9 +226,8 @@ class DetectionHead(BaseModule, NeedsTargets):
         """
         last = outputs[-1]
         results = []
-        for scores, references in zip(last.scores, last.references, strict=True):  # each sample
-            fields = self.reference.decode(references)
-            scores = self.coder.weigh_scores(scores, fields)
+        for logits, references in zip(last.scores, last.references, strict=True):  # each sample
+            scores, fields = self.decode(logits, references)
             best = self.coder.decode(scores, fields["pts"])
             best_fields = self.select_detections(fields, best)
             detections = self.coder.unfold_lines(best_fields, best.labels)
@@ -237,6 +236,20 @@ class DetectionHead(BaseModule, NeedsTargets):
             metainfo = dict(self.reference.metainfo)  # `InstanceData` accepts no other mapping
             results.append(InstanceData(metainfo=metainfo, **detections))
         return results
+
+    def decode(self, scores: Tensor, references: Any) -> tuple[Tensor, Tensors]:
+        """Decode the elements of a sample, and weigh their scores by their geometry.
+
+        Args:
+            scores: Class logits. (N, classes)
+            references: Encoded geometry of the elements.
+
+        Returns:
+            Class logits for the selection of detections (N, classes), and the decoded fields by
+            name. (N, ...) each
+        """
+        fields = self.reference.decode(references)
+        return self.coder.weigh_scores(scores, fields), fields
 
     def select_detections(self, fields: Tensors, best: Detections) -> Tensors:
         """Select the fields of the detections from the fields of all queries.

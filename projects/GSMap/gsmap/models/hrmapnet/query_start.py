@@ -166,8 +166,8 @@ class PriorHook(FlowHook):
         if head.coder.weighs_scores:
             weighted_scores = []
             for references, logits in zip(last.references.detach(), scores, strict=True):
-                fields = head.reference.decode(references[:num_instances])
-                weighted_scores.append(head.coder.weigh_scores(logits, fields))
+                sample_scores, _ = head.decode(logits, references[:num_instances])
+                weighted_scores.append(sample_scores)
             scores = torch.stack(weighted_scores)
         # A `LateValues` copies in the background: the host waits only when the values are read.
         self.scores = LateValues(scores.float())
