@@ -102,9 +102,10 @@ def test_own_records_and_other_ones_among_them(tmp_path):
         from_records(target, iter(records), meta, tmp_path, shard)
 
     assert assert_joined(make, target, 3) == [133, 133, 134]
-    from_records(target, records[1:], meta, tmp_path, Shard(1, 3))
-    with pytest.raises(ValueError, match="different work, which differs in input"):
-        merge([str(target)])
+    for others, join in ((records[1:], False), (records, True)):
+        from_records(target, others, meta, tmp_path, Shard(1, 3), join=join)
+        with pytest.raises(ValueError, match="different work, which differs in input"):
+            merge([str(target)])
 
 
 def test_shards_without_any_sample_are_no_file(tmp_path):

@@ -113,9 +113,9 @@ def from_records(
     source = ""
     if shard.count:
         # Shards can be joined only if they are parts of one list. `source` identifies the list by
-        # the tokens of all records, and by their calibration.
+        # the tokens of all records, by `join`, and by their calibration.
         records = list(records)
-        lines = []
+        lines = [f"join: {join}"]
         for record in records:
             lines.append(str(record.get("token") if isinstance(record, Mapping) else record))
         if calibration is not None:
