@@ -141,6 +141,12 @@ def test_few_views_and_new_ground_are_no_changes():
         "0 removed, 0 added, 0 moved (not compared: 1 divider on new ground; 1 divider of the old "
         "map not in view)"
     )
+    small = np.array([[0, 50], [0.9, 50], [0.9, 51], [0, 51], [0, 50]])
+    areas = [(1, small), (1, small[:2]), (1, small * 2 - [0, 50])]
+    found = find_changes(map_of([(0, UP), *areas]), [Pass(drive, map_of([(0, UP)]))])
+    assert summarize_changes(found) == (
+        "1 removed, 0 added, 0 moved (not compared: 2 ped_crossing of the old map below 1 m2)"
+    )
     empty = find_changes(MapElements.from_polylines(), [Pass(drive, map_of([(0, UP)]))])
     assert empty.changes == []
 

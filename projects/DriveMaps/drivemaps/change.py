@@ -76,11 +76,14 @@ class Changes:
         num_not_in_view: Number of elements of the old map that no pass has in view, by class name:
             lines without a point in view, and areas with less than 80 percent of their outline in
             view.
+        num_too_small: Number of areas of the old map in view that enclose less than 1 square metre,
+            by class name.
     """
 
     changes: list[Change]
     num_on_new_ground: dict[str, int] = field(default_factory=dict)
     num_not_in_view: dict[str, int] = field(default_factory=dict)
+    num_too_small: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,7 @@ from drivemaps.geodetic import MapGrid, MapOrigin
 from drivemaps.geojson import write_features
 from drivemaps.line_changes import line_changes
 from drivemaps.line_matching import sample_line
+from drivemaps.truth import polygons_of
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import (
     MAX_TOTAL_LENGTH_M,
@@ -113,7 +114,17 @@ def find_changes(
     is_in_view = np.zeros(len(whole_map), dtype=np.bool_)
     is_in_view[is_near] = _are_in_view(old, passes)
     num_not_in_view = Counter(classes[label] for label in whole_map.labels[~is_in_view])
-    return Changes(changes, dict(num_on_new_ground), num_not_in_view=dict(num_not_in_view))
+    num_too_small: Counter[str] = Counter()
+    for line, label, _ in whole_map.select(is_in_view).rows:
+        name = classes[label]
+        if name in AREA_CLASSES and not polygons_of([line[:, :2]]):
+            num_too_small[name] += 1
+    return Changes(
+        changes,
+        dict(num_on_new_ground),
+        num_not_in_view=dict(num_not_in_view),
+        num_too_small=dict(num_too_small),
+    )
 
 
 def _sample(elements: MapElements) -> tuple[FloatArray, IntArray]:
@@ -235,6 +246,7 @@ def summarize_changes(found: Changes) -> str:
     for count_by_class, reason in (
         (found.num_on_new_ground, "on new ground"),
         (found.num_not_in_view, "of the old map not in view"),
+        (found.num_too_small, "of the old map below 1 m2"),
     ):
         if count_by_class:
             numbers = ", ".join(f"{count} {name}" for name, count in sorted(count_by_class.items()))
