@@ -31,6 +31,8 @@ def test_entries_are_read_with_commas_in_values():
     assert parse_entry("b=c.py,x.y=[1,2],z=(a,b),q=1e-3") == (
         *("b", "c.py", ("x.y=[1,2]", "z=(a,b)", "q=1e-3")),
     )
+    nested = ("x=[[1,2],[3,4]]", "y=[(a,b),(c,d)]", "z=1")
+    assert parse_entry(",".join(["b=c.py", *nested])).options == nested
     with pytest.raises(ValueError, match="'typo' is no override; write KEY=VALUE"):
         parse_entry("b=c.py,typo")
     with pytest.raises(ValueError, match=r"got '\.\./b'"):

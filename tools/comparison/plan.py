@@ -67,9 +67,7 @@ def parse_entry(text: str) -> Entry:
     Raises:
         ValueError: If the name is not valid for a folder, or an override has no value.
     """
-    # Split at commas outside of brackets. A comma is inside of brackets if the next bracket after
-    # it is a closing one.
-    first, *options = re.split(r",(?![^\[(]*[\])])", text)
+    first, *options = _split_at_commas(text)
     name, separator, config = first.rpartition("=")
     if not separator:  # no name is given
         name = Path(config).stem
@@ -79,6 +77,22 @@ def parse_entry(text: str) -> Entry:
         if "=" not in option:
             raise InputError(f"{text!r}: {option!r} is no override; write KEY=VALUE.")
     return Entry(name, config, tuple(options))
+
+
+def _split_at_commas(text: str) -> list[str]:
+    """Split a text at its commas outside of brackets."""
+    parts = [""]
+    depth = 0  # number of open brackets
+    for character in text:
+        if character == "," and depth == 0:
+            parts.append("")
+            continue
+        parts[-1] += character
+        if character in "([":
+            depth += 1
+        elif character in ")]":
+            depth -= 1
+    return parts
 
 
 @dataclass(frozen=True)
