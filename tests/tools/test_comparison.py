@@ -21,6 +21,8 @@ from comparison.results import (
     rescore,
 )
 
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.evaluation.core.results_json import write_results
 from gsmap.utils.faults import user_message
 
 CLASSES = ("divider", "boundary")
@@ -245,6 +247,51 @@ def test_results_of_different_ground_truth_are_refused(tmp_path):
     folders = [finished(tmp_path / "a", 0, 0), finished(tmp_path / "b", 0, 0, num_gts=8)]
     with pytest.raises(ValueError, match=r"a and .*b were tested on different data"):
         check_one_test_set([read_result("x", folder) for folder in folders])
+
+
+def test_figures_that_do_not_exist_are_in_no_mean_and_no_difference(tmp_path):
+    """The test set has no boundary, whose AP_raster is -1."""
+    results = []
+    for name, ap in (("a", 0.2), ("b", 0.5)):
+        results.append(read_result(name, finished(tmp_path / name, ap, ap), 0))
+        results[-1].figures["raster/boundary/AP"] = -1.0
+    text = markdown(results, "", "")
+    assert "| a | 1 | 20.0 | 20.0 | 20.0 | 20.0 | - | 20.0 |" in text
+    assert "| b | 1 | +30.0 | +30.0 | +30.0 | +30.0 | - | +30.0 |" in text
+    assert differences_to_first(results)["b"]["raster/boundary/AP"] == []
+
+
+def test_only_the_metrics_of_the_tables_are_compared(tmp_path):
+    results = [read_result(name, finished(tmp_path / name, 0.2, 0.2), 0) for name in "ab"]
+    results[1].figures["topology/divider/num_gts"] = 3.0
+    check_one_test_set(results)
+    results[1].figures = {"pld/PLD": 0.5}
+    with pytest.raises(ValueError, match=r"b/metrics.json has no figures of chamfer or raster"):
+        check_one_test_set(results)
+
+
+def test_a_test_of_some_samples_is_scored_again_on_these(minicity_annotations, tmp_path):
+    path = minicity_annotations["val"]
+    dataset = f"dict(data_root='{path.parent}/', ann_file='{path.name}', indices=1)"
+    folder = with_config(tmp_path / "a", f"test_dataloader = dict(dataset={dataset})\n")
+    result = read_result("a", folder, 0)
+    result.figures["chamfer/num_samples"] = 1.0
+    token = AnnotationFile(path).column("token")[0]
+    write_results(folder / "results.json", [(token, [])])
+    for report in rescore(result, {}):
+        assert report.tokens == [token]
+    result.figures["chamfer/num_samples"] = 2.0
+    with pytest.raises(ValueError, match=r"results.json has 1 samples of .* and 2 were tested"):
+        rescore(result, {})
+
+
+def test_seconds_a_sample_are_those_of_a_batch_divided_by_its_size(tmp_path):
+    folder = finished(tmp_path / "a", 0.2, 0.2)
+    config = folder / "test/20260101_000000/vis_data/config.py"
+    config.parent.mkdir(parents=True)
+    config.write_text("test_dataloader = dict(batch_size=4)\n")
+    (config.parents[1] / "20260101_000000.json").write_text('{"data_time": 0.2, "time": 1.0}\n')
+    assert read_result("a", folder, 0).costs == {"seconds a sample": pytest.approx(0.2)}
 
 
 def test_rules_of_both_metrics_may_change(minicity_annotations):

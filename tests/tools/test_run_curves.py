@@ -132,6 +132,16 @@ def test_missing_log_and_no_runs(tmp_path):
         plot_runs([])
 
 
+def test_validations_stand_at_the_ends_of_their_epochs_though_the_last_was_cut_off(tmp_path):
+    log = [
+        {"loss": 1.0, "step": step, "epoch": epoch}
+        for step, epoch in ((200, 1), (400, 1), (450, 2))
+    ]
+    run = read_run(write_log(tmp_path, "a", [*log, {"chamfer/mAP": 0.5, "step": 1}]), "a")
+    (panel,) = plot_iterations([SimpleNamespace(name="a", log=run)]).axes
+    assert panel.lines[0].get_xdata().tolist() == [400]
+
+
 def test_only_metrics_that_were_measured_have_a_panel(tmp_path):
     log = [
         {"loss": 1.0, "step": 1, "epoch": 1},

@@ -19,9 +19,10 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import newest_checkpoint
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig
 from gsmap.evaluation.core.evaluator import METRIC_NAMES, MapEvaluator
-from gsmap.evaluation.core.file_evaluation import evaluate_files
+from gsmap.evaluation.core.file_evaluation import SamplePairs, match_samples
 from gsmap.evaluation.core.raster_ap import RasterConfig
-from gsmap.evaluation.core.report import MetricReport, flat_metrics
+from gsmap.evaluation.core.report import UNDEFINED, MetricReport, flat_metrics
+from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
@@ -32,6 +33,7 @@ from gsmap.visualization.style import RUN_COLOURS
 from mapdata.upstream_configs.fields import Fields
 from mapdata.upstream_configs.reader import read_assignments
 
+_TABLE_PREFIXES = tuple(f"{name}/" for name in METRIC_NAMES)  # of the keys of figures in tables
 _COSTS = {  # number formats of the costs in the table, by cost
     "iterations": ".0f",
     "million parameters": ".2f",
@@ -100,11 +102,14 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     newest = newest_checkpoint(folder) if figures else None
     if newest:
         costs["million parameters"] = _count_parameters(newest) / 1e6
-    # The log of a test is named by its date. Its last line has the mean times per sample.
+    # The log of a test is named by its date. Its last line has the mean times per batch.
     tests = sorted(folder.glob("test/*/[0-9]*.json"))
     if tests:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])
-        costs["seconds a sample"] = timing["time"] - timing["data_time"]  # without loading
+        batch_size = _config(folder / "test").section("test_dataloader").get("batch_size", 1)
+        costs["seconds a sample"] = (
+            timing["time"] - timing["data_time"]
+        ) / batch_size  # no loading
     if seed is None and log:
         seed = _config(folder).section("randomness").get("seed")
         if not isinstance(seed, int | None):
@@ -173,8 +178,10 @@ def _config(folder: Path) -> Fields:
 def check_one_test_set(results: Sequence[Result]) -> None:
     """Check that all runs were tested on equal numbers of samples and elements.
 
+    Only the metrics of the tables count.
+
     Raises:
-        ValueError: If the numbers differ.
+        ValueError: If the numbers differ, or a run was tested by none of the metrics.
     """
     first_folder = None
     expected: dict[str, float] = {}
@@ -183,15 +190,20 @@ def check_one_test_set(results: Sequence[Result]) -> None:
             continue
         counts = {}
         for key, value in result.figures.items():
-            if key.endswith(("num_gts", "num_samples")):
+            if key.startswith(_TABLE_PREFIXES) and key.endswith(("num_gts", "num_samples")):
                 counts[key] = value
+        if not counts:
+            raise InputError(
+                f"{result.folder}/metrics.json has no figures of {' or '.join(METRIC_NAMES)}: test "
+                "the model again (tools/test.py --metrics-out)."
+            )
         if first_folder is None:
             first_folder = result.folder
             expected = counts
         elif counts != expected:
             raise InputError(
-                f"{first_folder} and {result.folder} were tested on different data: {expected} and "
-                f"{counts}."
+                f"{first_folder} and {result.folder} were tested on different data or by different "
+                f"metrics: {expected} and {counts}."
             )
 
 
@@ -230,9 +242,11 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
 def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
     """Score the ``results.json`` of a run again, with the changed rules of `evaluator_for`.
 
+    The samples are those of the test, which may be a part of the annotation file (``indices``).
+
     Raises:
-        ValueError: If the config in the folder is missing or names no annotation file, or if the
-            results cannot be evaluated.
+        ValueError: If the config in the folder is missing or names no annotation file, if the
+            results cannot be evaluated, or if they have other samples than the test.
     """
     dataset = _config(result.folder).section("test_dataloader.dataset")
     if "ann_file" not in dataset:
@@ -240,7 +254,23 @@ def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
     annotations = Path(str(dataset.get("data_root", "")), str(dataset["ann_file"]))
     evaluator = evaluator_for(annotations, changes)
     predictions = result.folder / "results.json"
-    reports, _ = evaluate_files(predictions, annotations, evaluator, default_workers())
+    # The test has compared the split of the model with the split of the annotations.
+    pairs = SamplePairs(
+        predictions,
+        annotations,
+        classes=evaluator.classes,
+        allow_mismatch=True,
+        allow_other_split=True,
+    )
+    tested = set(SampleFile(predictions, RESULTS_KEY, evaluator.classes).tokens())
+    samples = (sample for sample in pairs if sample.token in tested)
+    reports = evaluator.reports(match_samples(samples, evaluator, default_workers()))
+    for key, value in flat_metrics(reports).items():
+        if key.endswith("/num_samples") and result.figures.get(key, value) != value:
+            raise InputError(
+                f"{predictions} has {value:.0f} samples of {annotations}, and "
+                f"{result.figures[key]:.0f} were tested: test the model again."
+            )
     return reports
 
 
@@ -305,14 +335,15 @@ def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[
 
     Returns:
         Differences by name of the config, then by key of the figure, in one list with an entry for
-        each pair of `pairs_with_first`.
+        each pair of `pairs_with_first` in which the figure exists.
     """
     differences: dict[str, dict[str, list[float]]] = {}
     for first, result in pairs_with_first(results):
         by_figure = differences.setdefault(result.name, {})
         for key in _columns(results):
-            difference = result.figures[key] - first.figures[key]
-            by_figure.setdefault(key, []).append(difference)
+            known = by_figure.setdefault(key, [])
+            if UNDEFINED not in (first.figures[key], result.figures[key]):
+                known.append(result.figures[key] - first.figures[key])
     return differences
 
 
@@ -350,7 +381,8 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         seeds = f"{len(done)} ({failed} not done)" if failed else f"{len(done)}"
         row = [name, seeds]
         for key in columns:
-            row.append(_cell([result.figures[key] for result in done], factor=100))
+            values = [result.figures[key] for result in done if result.figures[key] != UNDEFINED]
+            row.append(_cell(values, factor=100))
         figure_rows.append(row)
         row = [name]
         for key, form in _COSTS.items():
@@ -359,7 +391,8 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         cost_rows.append(row)
     difference_rows = []
     for name, differences in differences_to_first(results).items():
-        row = [name, str(len(differences[columns[0]]))]  # number of seeds that both configs have
+        num_pairs = max(map(len, differences.values()), default=0)  # seeds of both configs
+        row = [name, str(num_pairs)]
         for key in columns:
             row.append(_cell(differences[key], factor=100, form="+.1f"))
         difference_rows.append(row)
@@ -447,10 +480,12 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
             label: str | None = name
             for log in runs:
                 steps, values = log.series(f"{metric}/mAP", validation=True)
-                last = log.train[-1]
-                if "epoch" in last:
+                # Iterations of an epoch. It is exact if the last one of an epoch was logged. The
+                # ratio of an epoch that was cut off is smaller.
+                per_epoch = [row["step"] / row["epoch"] for row in log.train if "epoch" in row]
+                if per_epoch:
                     # The steps of the validation are epochs. Convert them to iterations.
-                    steps = last["step"] / last["epoch"] * steps
+                    steps = max(per_epoch) * steps
                 panel.plot(steps, 100 * values, ".-", color=colour, label=label)
                 label = None  # one entry of the legend for all seeds
         panel.set_ylim(0)
