@@ -35,7 +35,10 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--table", type=output_file, help="also write the Markdown table to this file"
     )
-    return parser.parse_args()
+    args = parser.parse_args()
+    if args.keys and not args.out:
+        parser.error("--keys draws a picture: give --out, too")
+    return args
 
 
 def main() -> None:

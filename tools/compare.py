@@ -92,6 +92,8 @@ def parse_args() -> argparse.Namespace:
         parser.error("give --budget, the iterations of every run")
     if args.seeds < 1 or args.batch < 1:
         parser.error("--seeds and --batch must be at least 1")
+    if args.rescore and (args.only or args.slurm):
+        parser.error("--rescore writes tables of all runs: leave out --only and --slurm")
     return args
 
 

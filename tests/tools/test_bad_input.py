@@ -150,6 +150,7 @@ analyze_run: list.json | list.json holds no record of training
 analyze_run: bytes.py | bytes.py cannot be read: it is UTF-16
 analyze_run: log.json --keys los --out a.png | no run logged ['los']
 analyze_run: log.json --out a.xyz | xyz
+analyze_run: log.json --keys los | --keys draws a picture: give --out, too
 convert_checkpoint: nowhere.pth out.pth | There is no checkpoint nowhere.pth
 convert_checkpoint: foreign.pth out.pth | foreign.pth: keys that upstream's maptr does not have: layer0.weight
 convert_checkpoint: K plain.txt | plain.txt exists already
@@ -178,6 +179,7 @@ compare: --list --tables zzz | no table is named 'zzz'
 compare: nowhere --budget 3 --out cmp | There is no config file nowhere
 compare: maptr_r18_minicity --budget 3 --out cmp --init nowhere | There is no checkpoint nowhere
 compare: --runs A=nowhere --out cmp | nowhere
+compare: --runs A=nowhere --out cmp --rescore dim=2 --only A/seed_0 | leave out --only and --slurm
 export: C K --out . | Is a directory
 export: C nowhere.pth --out m.onnx | There is no checkpoint nowhere.pth
 export: C K --out m.onnx --samples nowhere | nowhere
