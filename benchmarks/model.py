@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from mmdet3d.registry import MODELS, TRANSFORMS
 from mmdet3d.structures import Det3DDataSample
-from mmengine.config import DictAction
+from mmengine.config import Config, DictAction
 from mmengine.structures import InstanceData
 
 from benchmarks.measure import Cost, in_own_process, markdown_table
@@ -76,6 +76,11 @@ def measure_each(
     return costs
 
 
+def config_of(path: str, args: argparse.Namespace) -> Config:
+    """Read a config with the overrides of ``--cfg-options``."""
+    return read_config(path, getattr(args, "cfg_options", None))
+
+
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     """Build a config's model with random weights.
 
@@ -89,7 +94,7 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
         The model on the device of the options.
     """
     torch.set_num_threads(args.threads)
-    cfg = read_config(path, getattr(args, "cfg_options", None))
+    cfg = config_of(path, args)
     if raster:
         rows, columns = map(int, raster.split("x"))
         x_min, x_max = cfg.model.grid.x_range
@@ -120,7 +125,7 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
         ValueError: If the options have no ``size``, and the config does not state the size of its
             image files.
     """
-    cfg = read_config(path)
+    cfg = config_of(path, args)
     dataset = cfg.test_dataloader.dataset
     cameras = len(dataset.cameras)
     if args.size:
@@ -146,10 +151,9 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
     return cameras, height, width
 
 
-def mask_stride(path: str) -> int:
+def mask_stride(cfg: Config) -> int:
     """Edge of a cell of a config's camera masks in image pixels; a default without such masks."""
-    pipeline = read_config(path).train_dataloader.dataset.pipeline
-    for step in pipeline:
+    for step in cfg.train_dataloader.dataset.pipeline:
         if step.type == "MakePVMask":
             return step.get("stride", MakePVMask.stride)
     return MakePVMask.stride
@@ -177,7 +181,8 @@ def model_and_batch(
     """
     model = build(path, args, raster=raster)
     shape = image_shape(path, args)
-    stride = mask_stride(path)
+    cfg = config_of(path, args)
+    stride = mask_stride(cfg)
     generator = torch.Generator().manual_seed(0)
     cameras, height, width = shape
     images = torch.randn(batch, cameras, 3, height, width, generator=generator).to(args.device)
@@ -213,7 +218,7 @@ def model_and_batch(
         )
         sample.gt_instances_3d = instances.to(args.device)
         add_auxiliary_targets(sample, model, shape=shape, stride=stride, generator=generator)
-        add_config_targets(sample, path, grid=grid)
+        add_config_targets(sample, cfg, grid=grid)
         samples.append(sample.to(args.device))
     return model, {"imgs": images}, samples
 
@@ -230,15 +235,14 @@ def advance_samples(samples: Sequence[Det3DDataSample]) -> None:
         )
 
 
-def add_config_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> None:
+def add_config_targets(sample: Det3DDataSample, cfg: Config, grid: BEVGrid) -> None:
     """Add the targets that a config's head and losses need, made from the sample's elements.
 
     Args:
         sample: Sample with elements as ground truth; changed in place.
-        path: Config file.
+        cfg: Config.
         grid: Grid of the head.
     """
-    cfg = read_config(path)
     transforms = needed_targets(cfg).keys() - RANDOM_TARGETS  # names of transforms
     instances = sample.gt_instances_3d
     labels = instances.labels_3d.tolist()
@@ -323,7 +327,10 @@ def report(args: argparse.Namespace, header: list[str], rows: list[list[str]]) -
         rows: Cells of each row.
     """
     clock = "wall clock" if args.device != "cpu" else "processor time of all threads"
-    kind = "fp16 autocast" if args.fp16 else "float32"
+    conditions = ["float32"]
+    if args.fp16:
+        conditions = ["bfloat16" if args.device == "cpu" else "float16"]
+    conditions += [f"{key}={value}" for key, value in (args.cfg_options or {}).items()]
     sizes: list[str] = []
     for path in args.configs:
         cameras, height, width = image_shape(path, args)
@@ -331,6 +338,6 @@ def report(args: argparse.Namespace, header: list[str], rows: list[list[str]]) -
         if size not in sizes:
             sizes.append(size)
     print(
-        f"{' and '.join(sizes)}, {kind}, {args.device}, {args.threads} threads, "
+        f"{' and '.join(sizes)}, {', '.join(conditions)}, {args.device}, {args.threads} threads, "
         f"torch {torch.__version__}; {clock}\n\n{markdown_table(header, rows)}"
     )

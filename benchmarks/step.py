@@ -14,7 +14,7 @@ from mmengine.optim import build_optim_wrapper
 from benchmarks import model as models
 from benchmarks.measure import MIB, Cost, measure
 from gsmap.engine.figures import keep_figures
-from gsmap.engine.launch import read_config
+from gsmap.engine.optimizers import use_mixed_precision
 
 # Steps per measured call on a GPU. The host waits for the GPU only after the last one.
 STEPS_IN_A_ROW = 8
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> None:
     """
     tasks: list[tuple[str, argparse.Namespace, str]] = []  # arguments of `step_cost`
     for path in args.configs:
-        is_gsmap = "GSMap" in read_config(path).model.map_head.type
+        is_gsmap = "GSMap" in models.config_of(path, args).model.map_head.type
         rasters = args.rasters if is_gsmap else [""]  # other heads have no such raster
         for raster in rasters:
             tasks.append((path, args, raster))
@@ -71,7 +71,8 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     """Measure the training step of a config; on a GPU, the mean of several steps in a row.
 
     The step is mmengine's, from pixels on the host to new weights, with the optimizer and gradient
-    clipping of the config, and the collection of the losses and statistics for the log.
+    clipping of the config, and the collection of the losses and statistics for the log. With
+    ``--fp16``, it is in mixed precision, as with ``tools/train.py --amp``.
 
     Args:
         path: Config file.
@@ -84,7 +85,11 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     """
     model, inputs, samples = models.model_and_batch(path, args, batch=args.batch, raster=raster)
     model.train()
-    wrapper = build_optim_wrapper(model, read_config(path, args.cfg_options).optim_wrapper)
+    device = torch.device(args.device)
+    settings = models.config_of(path, args).optim_wrapper
+    if args.fp16:
+        use_mixed_precision(settings, on_gpu=device.type != "cpu")
+    wrapper = build_optim_wrapper(model, settings)
     # The data preprocessor of the model takes pixels on the host, so the inputs are converted back.
     images = []
     for normalized in inputs["imgs"]:  # images of one sample (V, 3, H, W)
@@ -104,7 +109,6 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
         prefixed = {f"train/{name}": value for name, value in figures.items()}
         keep_figures(wrapper.message_hub, prefixed)
 
-    device = torch.device(args.device)
     if device.type == "cpu":
         return measure(step, device, repeats=args.repeats)
 

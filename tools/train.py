@@ -113,6 +113,7 @@ def main() -> None:
 
     from gsmap.checkpoints.building import building
     from gsmap.engine.launch import load_config
+    from gsmap.engine.optimizers import use_mixed_precision
     from gsmap.engine.overfitting import overfit
     from gsmap.engine.run_log import MapRunner
 
@@ -122,11 +123,8 @@ def main() -> None:
     if args.overfit is not None:
         # This changes the config in place.
         overfit(cfg, samples=args.overfit, iterations=args.overfit_iterations)
-    if args.amp and torch.cuda.is_available():
-        cfg.optim_wrapper.type = "MapAmpOptimWrapper"  # float16, with a scaled loss
-        cfg.optim_wrapper.setdefault("loss_scale", "dynamic")
-    elif args.amp:
-        cfg.optim_wrapper.type = "CPUAutocastOptimWrapper"  # bfloat16
+    if args.amp:
+        use_mixed_precision(cfg.optim_wrapper, on_gpu=torch.cuda.is_available())
     if args.auto_scale_lr:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
             raise InputError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")

@@ -47,6 +47,14 @@ def test_images_are_as_large_as_the_configs(config, shape):
     assert image_shape(path, argparse.Namespace(size=[64, 96])) == (shape[0], 64, 96)
 
 
+def test_overrides_of_images_and_cameras_are_measured():
+    args = argparse.Namespace(size=None, cfg_options={"image_scale": 0.25})
+    path = str(REPO / "configs/maptr/maptr_r50_24e.py")
+    assert image_shape(path, args) == (6, 256, 416)  # 225 x 400, padded to multiples of 32
+    args.cfg_options = {"test_dataloader.dataset.cameras": ["CAM_FRONT"]}
+    assert image_shape(path, args) == (1, 480, 800)
+
+
 LOSSES = cases_of_methods("LOSSES")
 
 
@@ -113,6 +121,17 @@ def test_a_step_is_measured_for_every_raster_of_gsmap(monkeypatch, capsys):
     rows = cells(capsys.readouterr().out)
     assert [row[1] for row in rows] == ["64x32", "80x40"]
     assert all(float(row[2]) > 0 for row in rows)
+
+
+def test_a_step_in_mixed_precision_is_that_of_a_training(monkeypatch, capsys):
+    monkeypatch.setattr(
+        "benchmarks.model.in_own_process", lambda function, *given: function(*given)
+    )
+    made = create_autospec(step.build_optim_wrapper, side_effect=step.build_optim_wrapper)
+    monkeypatch.setattr(step, "build_optim_wrapper", made)
+    run(step, str(REPO / "configs/maptr/maptr_r18_minicity.py"), "--fp16")
+    assert made.call_args.args[1]["type"] == "CPUAutocastOptimWrapper"
+    assert ", bfloat16, cpu, " in capsys.readouterr().out
 
 
 def test_a_model_with_memory_continues_its_streams_from_call_to_call():

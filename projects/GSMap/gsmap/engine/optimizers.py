@@ -101,6 +101,21 @@ class MapAmpOptimWrapper(_LateNorm, AmpOptimWrapper):
     """
 
 
+def use_mixed_precision(settings: dict[str, Any], on_gpu: bool) -> None:
+    """Set the type of an optimizer wrapper to mixed precision, in place.
+
+    Args:
+        settings: Settings of the wrapper in a config.
+        on_gpu: Whether the model is trained on a GPU, in float16 with a scaled loss. On a CPU, it
+            is trained in bfloat16.
+    """
+    if on_gpu:
+        settings["type"] = "MapAmpOptimWrapper"
+        settings.setdefault("loss_scale", "dynamic")
+    else:
+        settings["type"] = "CPUAutocastOptimWrapper"
+
+
 @OPTIM_WRAPPER_CONSTRUCTORS.register_module()
 class MergedGroupsConstructor(DefaultOptimWrapperConstructor):
     """mmengine's constructor, with one group for all parameters of equal settings.
