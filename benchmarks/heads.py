@@ -28,23 +28,18 @@ from gsmap.checkpoints.reading import load_weights
 from gsmap.datasets.annotations.record import CLASSES
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.launch import read_config
+from gsmap.evaluation.core.report import UNDEFINED
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write, write_text
 from gsmap.utils.parallel import ordered_map
 
 METRIC_NAMES = ("chamfer", "raster")  # APs with matches by Chamfer distance, and by raster IoU
 WARM_UP = 100  # iterations
+# Options that the stored features depend on.
+_FEATURE_OPTIONS = ("config", "checkpoint", "data_root")
 # Options that the figures (values of the metrics) depend on. The seed is not among them, because it
 # is part of the file names.
-_FIGURE_OPTIONS = (
-    "config",
-    "checkpoint",
-    "data_root",
-    "iterations",
-    "batch",
-    "lr",
-    "from_scratch",
-)
+_FIGURE_OPTIONS = (*_FEATURE_OPTIONS, "iterations", "batch", "lr", "from_scratch")
 
 
 @dataclass(frozen=True)
@@ -95,11 +90,13 @@ def run(args: argparse.Namespace) -> None:
         args: Parsed options of ``add_arguments``.
 
     Raises:
-        ValueError: If the output folder has figures of other settings.
+        ValueError: If the output folder has features or figures of other settings.
     """
     # Config file and overrides of each variant, as one text, by the name of the variant.
     variants: dict[str, str] = json.loads(args.variants.read_text())
     settings = {key: str(getattr(args, key)) for key in _FIGURE_OPTIONS}
+    feature_settings = {key: settings[key] for key in _FEATURE_OPTIONS}
+    record_settings(args.out / "settings.json", feature_settings)  # of the stored features
     for name, variant in variants.items():
         record_settings(args.out / f"{name}.settings.json", {**settings, "variant": variant})
     options = {"data_root": str(args.data_root)}  # the data root of each split
@@ -140,17 +137,19 @@ def run(args: argparse.Namespace) -> None:
 
 
 def record_settings(path: Path, settings: dict[str, str]) -> None:
-    """Write the settings of a variant's figures to a file, unless it has other settings.
+    """Write the settings of features or figures to a file, unless it has other settings.
 
     Args:
         path: JSON file.
-        settings: Values of the options that the figures depend on.
+        settings: Values of the options that the features or figures depend on.
 
     Raises:
         ValueError: If the file has other settings.
     """
     if path.exists() and json.loads(path.read_text()) != settings:
-        raise InputError(f"{path.parent} holds figures of other settings: give another --out.")
+        raise InputError(
+            f"{path.parent} holds features or figures of other settings: give another --out."
+        )
     write_text(path, json.dumps(settings, indent=1))
 
 
@@ -161,7 +160,8 @@ def cells(figures: dict[str, float]) -> list[str]:
         figures: Values by metric and class, such as ``chamfer/divider/AP``, and ``chamfer/mAP``.
 
     Returns:
-        One text for each class and one for the mean, such as ``60.1 / 55.3`` (Chamfer / raster).
+        One text for each class and one for the mean, such as ``60.1 / 55.3`` (Chamfer / raster);
+        ``-`` stands for a figure that does not exist.
     """
     keys = [f"{name}/AP" for name in CLASSES]
     keys.append("mAP")
@@ -170,7 +170,7 @@ def cells(figures: dict[str, float]) -> list[str]:
         percentages = []
         for metric in METRIC_NAMES:
             value = figures[f"{metric}/{key}"]
-            percentages.append(f"{100 * value:.1f}")
+            percentages.append("-" if value == UNDEFINED else f"{100 * value:.1f}")
         texts.append(" / ".join(percentages))
     return texts
 

@@ -18,6 +18,7 @@ import gsmap.registered  # noqa: F401
 from gsmap.utils.errors import InputError
 
 _CAMERAS = 6
+_BATCH = 4  # samples of a batch of worker processes
 # Steps of the pipelines. By default, images are converted to float32 directly after loading. With
 # ``on_device``, they stay in uint8, and the later image steps are only recorded for the GPU.
 _LOAD = {"type": "LoadCameraImages"}
@@ -78,11 +79,14 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
         batches of four that are in pinned memory if there is a GPU.
 
     Raises:
-        ValueError: If there are fewer than six images.
+        ValueError: If there are fewer than six images, or workers would measure no batch.
     """
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg"))
     if len(files) < _CAMERAS:
         raise InputError(f"{folder} has {len(files)} JPEG files: give a folder of six or more.")
+    if workers and (count <= _BATCH or min(workers) < 1):
+        # The first batch of each worker is not measured.
+        raise InputError(f"--workers must be >= 1, with --samples of more than {_BATCH}.")
     # Let OpenCV and torch use one thread, so that processor time is the time of one process.
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
@@ -107,7 +111,7 @@ def _samples_per_second(frames: Frames, workers: int) -> float:
     """Measure the samples per second, after the first batch of every worker process."""
     loader = DataLoader(
         frames,
-        batch_size=4,
+        batch_size=_BATCH,
         num_workers=workers,
         collate_fn=pseudo_collate,
         pin_memory=torch.cuda.is_available(),

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import shapely
 
 from benchmarks.data import measure_loading, open_maps, per_item_orders, tile_annotations
+from benchmarks.images import measure_images
 from benchmarks.memory import tile_tables
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapInstance
@@ -26,6 +28,14 @@ def test_ground_truth_made_per_item_equals_the_prepared_one(minicity_root, minic
             np.testing.assert_allclose(
                 total_length(fast, label), total_length(slow, label), atol=1e-6
             )
+
+
+@pytest.mark.parametrize(("count", "workers"), [(4, [1]), (10, [2, 0])])
+def test_workers_that_measure_no_batch_are_refused(count, workers, tmp_path):
+    for number in range(6):
+        (tmp_path / f"{number}.jpg").touch()
+    with pytest.raises(ValueError, match=r"--workers must be >= 1, with --samples of more than 4"):
+        measure_images(tmp_path, count, workers)
 
 
 def test_orders_made_per_item_equal_the_vectorised_ones():

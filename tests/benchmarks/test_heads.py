@@ -1,7 +1,7 @@
 """The ablation of heads on stored features: paired, resumable, from a common checkpoint."""
 
 import json
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 import pytest
@@ -52,3 +52,25 @@ def test_variants_of_a_head_are_trained_on_stored_features(
     heads.run(args)
     new = json.loads((args.out / "new-0.json").read_text())
     assert new["chamfer/mAP"] < figures[0]["chamfer/mAP"] / 10
+
+
+def test_features_of_another_checkpoint_are_not_used_for_new_variants(tmp_path, monkeypatch):
+    monkeypatch.setattr(heads, "store_features", lambda cfg, checkpoint, part, path: path.touch())
+    figures = {f"{m}/{c}/AP": -1.0 for m in heads.METRIC_NAMES for c in heads.CLASSES}
+    figures |= {f"{metric}/mAP": 0.5 for metric in heads.METRIC_NAMES}
+    monkeypatch.setattr(
+        heads, "ordered_map", lambda work, tasks, *_, **__: [figures for _ in tasks]
+    )
+    config = str(REPO / "configs/maptr/maptr_r18_minicity.py")
+    parser = ArgumentParser()
+    heads.add_arguments(parser)
+    for checkpoint, name in (("a.pth", "first"), ("a.pth", "second"), ("b.pth", "third")):
+        variants = tmp_path / f"{name}.json"
+        variants.write_text(json.dumps({name: config}))
+        words = [config, checkpoint, str(variants), "--out", str(tmp_path / "out")]
+        args = parser.parse_args([*words, "--data-root", str(tmp_path)])
+        if checkpoint == "a.pth":
+            heads.run(args)
+    with pytest.raises(ValueError, match="out holds features or figures of other settings"):
+        heads.run(args)
+    assert heads.cells(figures) == ["- / -"] * 3 + ["50.0 / 50.0"]
