@@ -140,7 +140,15 @@ def test_images_without_a_partner_are_counted(tmp_path):
     names = {"front": ["0.png", "1.png", "2.png"], "left": ["1.png", "2.png", "x.png", "y.png"]}
     source = open_input(folder_of(tmp_path / "drive", names))
     assert [len(sample.cameras) for sample in source.samples] == [1, 2, 2]
-    assert "camera 'left': 2 of 4 images used, for 3 samples; for the other" in source.notes[1]
+    assert "camera 'left': 2 of 4 images used, in 2 of 3 samples; the others" in source.notes[1]
+
+
+def test_an_image_of_two_samples_is_counted_once(tmp_path):
+    """The only image of the slow camera is within 50 ms of the first two of three samples."""
+    front = [f"{1_700_000_000_000 + late_ms}.png" for late_ms in (0, 40, 200)]
+    names = {"front": front, "slow": ["1700000000020.png"]}
+    source = open_input(folder_of(tmp_path / "drive", names))
+    assert "camera 'slow': 1 of 1 image used, in 2 of 3 samples" in source.notes[1]
 
 
 def test_samples_without_a_pose_are_counted_and_none_is_an_error(tmp_path):

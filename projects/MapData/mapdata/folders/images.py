@@ -320,20 +320,22 @@ def _check_rate(times_ns: Sequence[int], rate_hz: float | None) -> None:
 def _usage_notes(
     frames: Sequence[RigFrame], images: Mapping[str, Sequence[Path]], tolerance_ns: int
 ) -> list[str]:
-    """Notes on cameras that do not have exactly one image for each sample."""
-    first = next(iter(images))
-    counts: Counter[str] = Counter()
+    """Notes on cameras with unused images, or without an image in some samples."""
+    counts: Counter[str] = Counter()  # samples with an image of the camera
+    used: dict[str, set[str]] = {name: set() for name in images}  # an image may be in two samples
     for frame in frames:
         counts.update(frame.images.keys())
+        for name, (path, _) in frame.images.items():
+            used[name].add(path)
     notes = []
     for name, paths in images.items():
-        all_are_used = counts[name] == len(paths)
+        all_are_used = len(used[name]) == len(paths)
         all_have_one = counts[name] == len(frames)
         if not (all_are_used and all_have_one):
             notes.append(
-                f"camera {name!r}: {counts[name]} of {format_count(len(paths), 'image')} used, for "
-                f"{format_count(len(frames), 'sample')}; for the other images, {first!r} has none "
-                f"of the same name or within {tolerance_ns / 1e6:g} ms"
+                f"camera {name!r}: {len(used[name])} of {format_count(len(paths), 'image')} used, "
+                f"in {counts[name]} of {format_count(len(frames), 'sample')}; the others have no "
+                f"partner of the same name or within {tolerance_ns / 1e6:g} ms"
             )
     return notes
 
