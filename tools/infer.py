@@ -35,6 +35,7 @@ from mapdata.bag_topics import parse_topics
 from mapdata.calibration_check import (
     calibration_figure,
     calibration_warnings,
+    first_samples,
     image_warnings,
 )
 from mapdata.command_line import parse_rate
@@ -70,7 +71,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--check-calibration",
         type=output_file,
         metavar="FILE.png",
-        help="judge the calibration, draw the ground plane over the first sample's images, and end",
+        help="judge the calibration, draw the ground plane over each camera's first image, and end",
     )
     parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
     parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
@@ -259,14 +260,15 @@ def require_own_samples(path: Path) -> None:
 def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
     """Print warnings about implausible properties of the cameras.
 
-    With ``--check-calibration``, also draw the ground plane over the images of the first sample.
+    With ``--check-calibration``, also draw the ground plane over the first image of each camera.
 
     Returns:
         The warnings.
     """
-    sample = source.samples[0]
+    samples = first_samples(source.samples)
+    sample = samples[0]
     root = source.data_root or Path()
-    warnings = calibration_warnings(source.samples, source.frame, source.ground_z_m)
+    warnings = calibration_warnings(samples, source.frame, source.ground_z_m)
     warnings += image_warnings(sample, root)
     for line in warnings:
         print(f"calibration: {line}")

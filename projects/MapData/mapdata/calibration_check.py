@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from gsmap.datasets.annotations.record import RANGES, CameraRecord, MapSample
 from gsmap.datasets.image_files import image_size
 from gsmap.datasets.plausibility import calibration_warnings as calibration_warnings  # re-exported
+from gsmap.datasets.plausibility import first_samples as first_samples  # re-exported
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import frame_view

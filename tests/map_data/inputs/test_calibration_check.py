@@ -15,7 +15,12 @@ from gsmap.datasets.source import ground_from_frame, sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.visualization.figure import figure_to_rgb
 from mapdata.argoverse2.log import Argoverse2Log
-from mapdata.calibration_check import calibration_figure, calibration_warnings, image_warnings
+from mapdata.calibration_check import (
+    calibration_figure,
+    calibration_warnings,
+    first_samples,
+    image_warnings,
+)
 from mapdata.infos.recordings import read_info_file
 from tools import infer
 
@@ -149,6 +154,17 @@ def test_a_corrupted_calibration_is_noticed(town, name, change, message):
     assert any(re.search(message, line) for line in found), found
     if name is not None and name != "CAM_FRONT_LEFT":
         assert all(name in line for line in found)  # and no other camera
+
+
+def test_a_camera_that_the_first_sample_lacks_is_checked(town):
+    """The first sample lacks a camera, which is upside down in the second."""
+    first = replace(town[0], cameras=[c for c in town[0].cameras if c.name != FRONT])
+    samples = [first, replace(changed(town[0], FRONT, rolled(180)), token="second")]
+    (warning,) = calibration_warnings(samples, "lidar")
+    assert warning.startswith(f"camera {FRONT!r} is upside down")
+    (sample,) = first_samples(samples)
+    assert sample.token == first.token
+    assert len(sample.cameras) == len(town[0].cameras)
 
 
 def test_right_calibrations_pass(town, shared_dir):

@@ -1,6 +1,7 @@
 """Plausibility checks of camera calibrations."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,7 +31,7 @@ _SIDES = {"left": 90.0, "right": -90.0, "front": 0.0, "back": 180.0, "rear": 180
 def calibration_warnings(
     samples: Sequence[MapSample], frame: str, ground_z_m: float | None = None
 ) -> list[str]:
-    """Find implausible calibrations in the first sample of each drive.
+    """Find implausible calibrations of the cameras of each drive, where they first appear.
 
     Args:
         samples: Samples of one or more drives.
@@ -40,15 +41,30 @@ def calibration_warnings(
     Returns:
         Warnings without repetitions, one line each.
     """
-    first_samples: dict[str, MapSample] = {}
-    for sample in samples:
-        first_samples.setdefault(sample.scene, sample)
     warnings: list[str] = []
-    for sample in first_samples.values():
+    for sample in first_samples(samples):
         for line in _warnings(sample, frame=frame, ground_z_m=ground_z_m):
             if line not in warnings:
                 warnings.append(line)
     return warnings
+
+
+def first_samples(samples: Iterable[MapSample]) -> list[MapSample]:
+    """First sample of each drive, with the first record of every camera of the drive.
+
+    Cameras that the first sample lacks come from later samples.
+    """
+    samples_of: dict[str, MapSample] = {}  # first sample by scene
+    cameras_of: dict[str, dict[str, CameraRecord]] = {}  # first records by scene and name
+    for sample in samples:
+        samples_of.setdefault(sample.scene, sample)
+        cameras = cameras_of.setdefault(sample.scene, {})
+        for camera in sample.cameras:
+            cameras.setdefault(camera.name, camera)
+    return [
+        replace(sample, cameras=list(cameras_of[scene].values()))
+        for scene, sample in samples_of.items()
+    ]
 
 
 def _warnings(sample: MapSample, frame: str, ground_z_m: float | None) -> Iterator[str]:
