@@ -149,6 +149,11 @@ def test_a_map_in_grid_coordinates_comes_into_the_frame(drive: Path) -> None:
             r"camera 'left' has \['intrinsics'\], which .* defines: leave them out",
         ),
         ({"cameras": [{"name": "left"}]}, "it has no 'path'"),
+        (
+            {"cameras": [{"name": "left", "path": "l.jpg", "timestamp_ns": START_NS + 10**9}]},
+            "'left' has another timestamp_ns than the record, .*, without a pose near it",
+        ),
+        ({"ego_from_frame": np.diag([-1, -1, 1, 1])}, "leave it out in the frame 'ego'"),
     ],
 )
 def test_records_that_do_not_fit_the_file_are_named(drive: Path, change: dict, message: str):
@@ -159,6 +164,17 @@ def test_records_that_do_not_fit_the_file_are_named(drive: Path, change: dict, m
     with pytest.raises(ValueError, match=rf"record 't1'.*{message}"):
         from_records(drive / "a.arrow", records, META, drive, calibration=file)
     assert not (drive / "a.arrow").exists()
+
+
+def test_times_of_images_need_poses(drive: Path) -> None:
+    file = drive / "calibration.yaml"
+    file.write_text(CALIBRATION.replace("poses: poses.csv", ""))
+    records = records_of(drive, global_from_frame=np.eye(4))
+    with pytest.raises(ValueError, match=r"record 't0'.*camera 'left' has another timestamp_ns"):
+        from_records(drive / "a.arrow", records, META, drive, calibration=file)
+    for record in records:
+        record["cameras"][1]["timestamp_ns"] = record["timestamp_ns"]
+    assert from_records(drive / "a.arrow", records, META, drive, calibration=file) == 2
 
 
 def test_a_missing_or_malformed_calibration_file_is_named(drive: Path) -> None:

@@ -17,7 +17,7 @@ from gsmap.datasets.source import Mount, change_frame, ground_from_frame
 from gsmap.utils.errors import InputError
 from gsmap.utils.shards import WHOLE, Shard, digest
 from mapdata.folders.calibration_file import read_calibration, read_vehicle
-from mapdata.folders.rig import RigCamera, RigFrame, rig_samples
+from mapdata.folders.rig import PoseAt, RigCamera, RigFrame, rig_samples
 from mapdata.paths import path_below
 
 _KEYS = {"name", "path", "timestamp_ns"}  # keys that a camera of a record may have
@@ -54,8 +54,9 @@ def calibrated_records(
     Raises:
         FileNotFoundError: If the calibration file, or its file of poses, does not exist.
         ValueError: If the file is malformed, if a camera is not in it or has a key that the file
-            defines, if a record has no pose near its time, or if a record has a pose and the file
-            names poses, too.
+            defines, if a record has no pose near its time, if an image of another time has none, or
+            if a record has a pose and the file names poses, too. Also if a record in the frame
+            ``ego`` has a mounting.
     """
     # Images of each camera. Their size is used if the calibration file has no ``size_px``.
     images: dict[str, list[Path]] = {}
@@ -91,6 +92,7 @@ def calibrated_records(
             samples = rig_samples(scene, rig, frames=[rig_frame], pose_at=pose_at)
             if not samples:  # `rig_samples` leaves out a `RigFrame` without a pose
                 raise InputError(f"{file} has no pose near timestamp_ns {rig_frame.time_ns}.")
+            _require_image_poses(rig_frame, pose_at=pose_at, file=file)
             # `rig_samples` returns samples in the frame `ego`.
             sample = _in_frame(samples[0], record=record, meta=meta)
             completed = {**record, "ego_from_frame": sample.ego_from_frame}
@@ -179,6 +181,17 @@ def _rig_frame(
     return RigFrame(str(record["token"]), time_ns=time_ns, images=images)
 
 
+def _require_image_poses(rig_frame: RigFrame, pose_at: PoseAt | None, file: Path) -> None:
+    """Raise a ``ValueError`` if the motion between a record and one of its images is unknown."""
+    for name, (_, time_ns) in rig_frame.images.items():
+        has_pose = pose_at is not None and pose_at(time_ns) is not None
+        if time_ns != rig_frame.time_ns and not has_pose:
+            raise InputError(
+                f"camera {name!r} has another timestamp_ns than the record, {time_ns}, without a "
+                f"pose near it, so the motion in between is unknown: add it to `poses` of {file}."
+            )
+
+
 def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta) -> MapSample:
     """Transform a sample from the frame ``ego`` to the annotation frame.
 
@@ -194,6 +207,11 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
     if ego_from_frame is None:
         mount = Mount(meta.frame, ground_z_m=ground_z_m)
     else:
+        if meta.frame == "ego" and not np.allclose(ego_from_frame, np.eye(4)):
+            raise InputError(
+                "ego_from_frame is the mounting of the frame 'lidar': leave it out in the frame "
+                "'ego', which is the vehicle."
+            )
         # `ground_from_frame` takes a sample, of which it uses only the mounting. So the mounting of
         # the record is set in a copy of the sample.
         sample_with_mount = replace(sample, ego_from_frame=np.asarray(ego_from_frame, np.float64))
