@@ -134,6 +134,11 @@ def test_lidar_and_signals_are_kept(tmp_path: Path):
     ("bad", "message"),
     [
         (record(gt=[]), r"unknown keys \['gt'\]"),
+        (
+            record(cameras=[{**record()["cameras"][0], "distorsion": [-0.3, 0.1, 0, 0]}]),
+            r"camera 'front': unknown keys \['distorsion'\]; known are \['cam_from_frame'",
+        ),
+        (record(lidar={"path": "l.bin", "sweep": []}), r"lidar: unknown keys \['sweep'\]"),
         ({"token": "t"}, "record 't' cannot be used: it has no 'cameras'"),
         (record(instances=[{"label": "tree", "points": [[0, 0], [1, 1]]}]), "'tree' is not among"),
         (record(instances=[{"label": 0, "points": [[0, 0, 0], [1, 1, 1]]}]), r"\(n >= 2, 2\)"),
@@ -258,6 +263,10 @@ def test_a_map_in_global_coordinates_is_moved_into_each_frame(tmp_path: Path):
     from_records(tmp_path / "h.arrow", [record_3d], meta, tmp_path)
     (found,) = AnnotationFile(tmp_path / "h.arrow")[0].instances
     np.testing.assert_allclose(found.points, [[0, 2, -1], [10, 2, -1.5]], atol=1e-6)
+    for points in (line["points"], [], np.zeros((2, 5, 3))):
+        bad = {"global_instances": [{"label": 0, "points": points}], "global_from_frame": pose}
+        with pytest.raises(ValueError, match=r"global_instances must be \(n >= 2, 3\)"):
+            from_records(tmp_path / "w.arrow", [record(**bad)], meta, tmp_path)
     for changes, message in (
         ({"global_instances": [line]}, "need global_from_frame"),
         ({**whole, "instances": []}, "not both"),

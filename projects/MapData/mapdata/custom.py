@@ -53,7 +53,9 @@ _ALL_ELEMENTS_LOST = (
 _COPY_M = 0.01  # largest distance of two copies of a line
 _SAME_PLACE_M = 0.1  # ends of lines within this distance are one place
 _GLOBAL = "global_instances"
-_KEYS = sorted([*(field.name for field in fields(MapSample)), _GLOBAL])
+_KEYS = [*(field.name for field in fields(MapSample)), _GLOBAL]
+_CAMERA_KEYS = [*(field.name for field in fields(CameraRecord)), "distortion", "distortion_model"]
+_LIDAR_KEYS = [field.name for field in fields(LidarRecord)]
 Record = TypeVar("Record")
 
 
@@ -153,9 +155,7 @@ def create_samples(
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
         with explain_errors(f"record {name!r}", "correct it"):
-            unknown = set(record) - set(_KEYS)
-            if unknown:
-                raise InputError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
+            _require_keys(record, known=_KEYS)
             sample = _create_sample(record, meta=meta, root=root)
             check_samples([sample], meta)  # raises an error for a wrong shape or value
             count += 1
@@ -259,6 +259,13 @@ def _nearby_place(places: Sequence[np.ndarray], point: np.ndarray) -> np.ndarray
     return None
 
 
+def _require_keys(values: Mapping[str, Any], known: Sequence[str], where: str = "") -> None:
+    """Raise a ``ValueError`` if a mapping has unknown keys, which would have no effect."""
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise InputError(f"{where}unknown keys {unknown}; known are {sorted(known)}.")
+
+
 def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     """Create the sample of a record. The caller checks its values (`check_samples`)."""
     token = record["token"]
@@ -278,6 +285,7 @@ def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
     ]
     if "lidar" in values:
         lidar = values["lidar"]
+        _require_keys(lidar, known=_LIDAR_KEYS, where="lidar: ")
         frame_from_lidar = lidar.get("frame_from_lidar")
         values["lidar"] = LidarRecord(
             path=lidar["path"],
@@ -309,7 +317,13 @@ def _transform_elements(record: Mapping[str, Any], meta: AnnotationMeta) -> dict
         rotation = pose[:3, :3]
     instances = []
     for item in record[_GLOBAL]:
-        points = np.array(item["points"], np.float64)[:, : meta.dim]
+        points = np.array(item["points"], np.float64)
+        if points.ndim != 2 or points.shape[1] < meta.dim:
+            raise InputError(
+                f"points of {_GLOBAL} must be (n >= 2, {meta.dim}), as dim of the annotation file "
+                f"is {meta.dim}, got shape {points.shape}"
+            )
+        points = points[:, : meta.dim]
         offsets = points - pose[: points.shape[1], 3]
         local_points = offsets @ rotation  # points are rows, so this is the inverse rotation
         instances.append({**item, "points": local_points})
@@ -329,6 +343,7 @@ def _create_record(kind: type[Record], values: Mapping[str, Any]) -> Record:
 
 def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
     """Create the record of a camera; the size comes from the image if it is not given."""
+    _require_keys(camera, known=_CAMERA_KEYS, where=f"camera {camera['name']!r}: ")
     values = dict(camera)
     if camera.get("width") is None or camera.get("height") is None:
         where = f"sample {token!r}, camera {camera['name']!r}"
