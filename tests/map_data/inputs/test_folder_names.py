@@ -151,6 +151,15 @@ def test_an_image_of_two_samples_is_counted_once(tmp_path):
     assert "camera 'slow': 1 of 1 image used, in 2 of 3 samples" in source.notes[1]
 
 
+def test_a_neglected_motion_is_counted(tmp_path):
+    """The last pose is used for 0.1 s: for the front image after 80 ms, not for the left one."""
+    names = {"front": ["1700000000080.png"], "left": ["1700000000120.png"]}
+    drive = folder_of(tmp_path / "drive", names, poses="poses.csv")
+    (drive / "poses.csv").write_text(f"{HEAD}\n{START_NS},0,0,0,1,0,0,0\n")
+    expected = "camera 'left': no pose is near the time of its image at 1 of 1 sample: the motion"
+    assert expected in open_input(drive).notes[1]
+
+
 def test_samples_without_a_pose_are_counted_and_none_is_an_error(tmp_path):
     names = {"front": [f"{1_700_000_000_000 + 500 * i}.png" for i in range(5)]}
     drive = folder_of(tmp_path / "drive", names, poses="poses.csv")

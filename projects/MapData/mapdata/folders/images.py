@@ -30,6 +30,7 @@ from mapdata.folders.rig import (
     PoseTrack,
     RigCamera,
     RigFrame,
+    motion_notes,
     nearest_images,
     rig_samples,
     set_rectification_targets,
@@ -93,6 +94,7 @@ def read_image_folder(
         if poses is not None and pose_at is not None:
             frames, pose_notes = _frames_with_poses(frames, poses=poses, pose_at=pose_at)
             notes += pose_notes
+            notes += motion_notes(frames, pose_at=pose_at)
         # The folder of the rectified images is named by a digest, which depends on this key.
         target_key = set_rectification_targets(rig, trained or {})
         scene = folder.resolve().name

@@ -4,6 +4,7 @@ A rig is the set of cameras on a vehicle. Rectification removes the distortion o
 it becomes an image of a pinhole camera.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from gsmap.datasets.source import sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_bytes
+from gsmap.utils.words import format_count
 from mapdata.argoverse2.log import closest_ns
 
 PoseAt = Callable[[int], np.ndarray | None]
@@ -293,6 +295,30 @@ def nearest_images(
     return frames
 
 
+def motion_notes(frames: Sequence[RigFrame], pose_at: PoseAt | None) -> list[str]:
+    """Notes on cameras whose motion between image and frame is unknown, so that it is neglected.
+
+    Args:
+        frames: Images of the cameras at each time, for which there is a pose.
+        pose_at: Pose of the vehicle at a time in nanoseconds; None if poses are not known.
+
+    Returns:
+        A line for each camera with images without a pose.
+    """
+    if pose_at is None:
+        return []
+    counts: Counter[str] = Counter()
+    for frame in frames:
+        for name, (_, time_ns) in frame.images.items():
+            counts[name] += pose_at(time_ns) is None
+    return [
+        f"camera {name!r}: no pose is near the time of its image at {count} of "
+        f"{format_count(len(frames), 'sample')}: the motion between image and sample is neglected"
+        for name, count in counts.items()
+        if count
+    ]
+
+
 def rig_samples(
     scene: str, rig: Sequence[RigCamera], frames: Sequence[RigFrame], pose_at: PoseAt | None
 ) -> list[MapSample]:
@@ -326,7 +352,7 @@ def rig_samples(
             image_pose = None if pose_at is None else pose_at(time_ns)
             cam_from_ground = camera.cam_from_ground
             # The vehicle moves between the time of the frame and the time of the image.
-            # If the pose at either time is unknown, this motion is neglected.
+            # If the pose at either time is unknown, this motion is neglected (`motion_notes`).
             if image_pose is not None and pose is not None:
                 cam_from_ground = cam_from_ground @ invert_rigid(image_pose) @ pose
             width, height = camera.size_px
