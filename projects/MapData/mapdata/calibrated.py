@@ -188,7 +188,8 @@ def _require_image_poses(rig_frame: RigFrame, pose_at: PoseAt | None, file: Path
         if time_ns != rig_frame.time_ns and not has_pose:
             raise InputError(
                 f"camera {name!r} has another timestamp_ns than the record, {time_ns}, without a "
-                f"pose near it, so the motion in between is unknown: add it to `poses` of {file}."
+                f"pose near it, so the motion in between is unknown: add it to `poses` of {file}, "
+                "or leave timestamp_ns out to neglect the motion."
             )
 
 
