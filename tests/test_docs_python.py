@@ -25,6 +25,7 @@ from model_cases import IMAGE_SHAPE, NUM_CAMS
 from report_case import write_case
 
 import gsmap.registered  # noqa: F401 - the configs name its classes
+from gsmap.datasets.transforms.images import LoadCameraImages, ScaleImages
 
 REPO = Path(__file__).resolve().parents[1]
 PAGES = [REPO / "README.md"]
@@ -74,8 +75,10 @@ def samples(folder: Path, minicity: Path) -> dict[str, Any]:
 def deployment(folder: Path, minicity: Path) -> dict[str, Any]:
     """What a reader of docs/deployment.md has beside exported files: an image and a drive."""
     cv2.imwrite(str(folder / "image.jpg"), np.full((225, 400, 3), 90, np.uint8))
+    cv2.imwrite(str(folder / "small.jpg"), np.full((180, 200, 3), 90, np.uint8))
     intrinsics = np.array([[320.0, 0, 200], [0, 320, 112], [0, 0, 1]])
     cameras = [("image.jpg", intrinsics, np.eye(4))] * NUM_CAMS
+    cameras[-1] = ("small.jpg", intrinsics, np.eye(4))
     images = [np.zeros((*IMAGE_SHAPE, 3), np.uint8)] * NUM_CAMS
     meta = {"scene": "a", "lidar2global": np.eye(4), "can_bus": np.zeros(18)}
     meta["lidar2img"] = np.stack([np.eye(4)] * NUM_CAMS)
@@ -182,6 +185,27 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path, monkeypatch, request):
             new = scope.keys() - before.keys() - {"__builtins__"}
             check_types({key: scope[key] for key in new})
     assert (tmp_path / MADE.get(name, "")).exists()
+
+
+def test_the_images_of_deployment_are_those_of_the_pipeline(tmp_path, monkeypatch):
+    """Cameras of two sizes: the smaller images are padded before all are scaled."""
+    given = deployment(tmp_path, tmp_path)
+    cameras = given["my_cameras"]
+    monkeypatch.chdir(tmp_path)
+    records = {}
+    for number, (path, intrinsics, cam_from_frame) in enumerate(cameras):
+        cam2img = np.eye(4)
+        cam2img[:3, :3] = intrinsics
+        records[number] = {"img_path": path, "cam2img": cam2img, "lidar2cam": cam_from_frame}
+    expected = LoadCameraImages().transform({"token": "t", "images": records})
+    expected = ScaleImages(scale=0.25).transform(expected)
+    block = BLOCK.findall((REPO / "docs/deployment.md").read_text())[0]
+    recipe = block[block.index("files = ") : block.index("elements = ")]
+    scope = {"cv2": cv2, "np": np, "my_cameras": cameras}
+    scope["model"] = SimpleNamespace(image_size=expected["img_shape"])
+    exec(recipe, scope)
+    np.testing.assert_allclose(scope["images"], expected["img"], atol=1)  # rounded to uint8
+    np.testing.assert_allclose(scope["lidar2img"], expected["lidar2img"])
 
 
 def test_a_stale_type_is_found():

@@ -162,7 +162,7 @@ class OnnxInferencer:
 
         Args:
             images: Images of ``cameras`` in their order: BGR as OpenCV reads them, values 0 to 255,
-                scaled to ``image_size``. (V, H, W, 3)
+                padded and scaled to ``image_size`` as in training. (V, H, W, 3)
             meta: Calibration of the sample. In the names of its fields, ``lidar`` is the annotation
                 frame.
 
