@@ -195,19 +195,23 @@ def other_figures(
 
     Args:
         earlier: All figures of the earlier run.
-        clean: Figures of this run without corruption. If they equal the earlier ones, both runs are
-            taken to have one model and equal samples.
+        clean: Figures of this run without corruption, and its ``seed``. If they equal the earlier
+            ones, both runs are taken to have one model and equal samples.
         args: The options of the command.
 
     Raises:
-        ValueError: If the figures without corruption differ, so that earlier ones would be lost.
+        ValueError: If the figures without corruption or the seeds differ, so that earlier ones
+            would be lost.
     """
     others = {kind: rows for kind, rows in earlier.items() if kind not in {CLEAN, *args.kinds}}
-    if others and earlier[CLEAN] != clean:
+    # Files of earlier versions have no seed: it is taken to be the default.
+    before = {"seed": 0, **earlier[CLEAN][0]} if others else clean[0]
+    if before != clean[0]:
         raise InputError(
-            f"{args.out} has figures of {', '.join(others)} of another model or other samples "
-            f"(AP {earlier[CLEAN][0]['mean']:.1f} without corruption, here "
-            f"{clean[0]['mean']:.1f}): give another --out, or name these --kinds too."
+            f"{args.out} has figures of {', '.join(others)} of another model, other samples or "
+            f"another seed (AP {before['mean']:.1f} without corruption and seed "
+            f"{before['seed']:g}, here {clean[0]['mean']:.1f} and {clean[0]['seed']:g}): give "
+            "another --out, or name these --kinds too."
         )
     return others
 
@@ -271,6 +275,7 @@ def main() -> str:
             measured.setdefault(kind, []).append(aps)
             bar.update(1)
             if kind == CLEAN:  # the first case, so that an error comes before the long measurement
+                aps["seed"] = args.seed  # of the corruptions, which later runs compare
                 others = other_figures(earlier, measured[CLEAN], args)
         measured.update(others)
         # In a fixed order, whether they were measured now or in an earlier run.

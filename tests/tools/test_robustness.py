@@ -71,14 +71,16 @@ def test_a_run_writes_table_figures_and_plot(
 def test_figures_of_earlier_runs_into_a_folder_are_kept(tool, tmp_path):
     path = tmp_path / "robustness.json"
     assert tool.earlier_figures(path) == {}
-    clean, other = [{"mean": 40.0}], [{"mean": 41.0}]
+    clean, other, seed = ([{"mean": m, "seed": s}] for m, s in ((40.0, 0), (41.0, 0), (40.0, 1)))
     rows = [{"mean": 20.0}] * 5
-    path.write_text(json.dumps({"none": clean, "fog": rows, "jpeg": rows}))
+    path.write_text(json.dumps({"none": [{"mean": 40.0}], "fog": rows, "jpeg": rows}))
     before = tool.earlier_figures(path)
     args = Namespace(out=tmp_path, kinds=["jpeg", "rain"])
     assert tool.other_figures(before, clean, args) == {"fog": rows}
-    with pytest.raises(ValueError, match=r"has figures of fog of another model .* give another"):
+    with pytest.raises(ValueError, match=r"has figures of fog of another model, .* give another"):
         tool.other_figures(before, other, args)
+    with pytest.raises(ValueError, match=r"without corruption and seed 0, here 40.0 and 1\): give"):
+        tool.other_figures(before, seed, args)
     assert tool.other_figures(before, other, Namespace(out=tmp_path, kinds=["fog", "jpeg"])) == {}
     for wrong in ("[]", "{}", '{"none": [{"mean": 1.0}], "mist": []}', '{"none": [{"mean": "a"}]}'):
         path.write_text(wrong)
