@@ -15,6 +15,7 @@ from torch.nn.functional import interpolate
 
 from benchmarks.measure import markdown_table
 from gsmap.apis.map_inferencer import MapInferencer
+from gsmap.utils.errors import InputError
 
 FULL_SIZE = (200, 400)  # rows and columns of nuScenes' maps in the paper
 
@@ -37,6 +38,9 @@ def run(args: argparse.Namespace) -> None:
 
     Args:
         args: Parsed options of ``add_arguments``.
+
+    Raises:
+        ValueError: If there is no frame after the first one.
     """
     torch.set_num_threads(1)
     inferencer = MapInferencer(args.config, args.checkpoint, device="cpu")
@@ -66,6 +70,11 @@ def run(args: argparse.Namespace) -> None:
 
     head.lines = time_lines  # replaces the method, which `vectorize_maps` still refers to
     rows_to_predict = range(min(args.samples + 1, len(dataset)))  # one more, for the first frame
+    if len(rows_to_predict) < 2:
+        raise InputError(
+            f"{len(dataset)} samples of {args.truth} and --samples {args.samples} leave no frame "
+            "after the first one: give two samples or more, and --samples of at least 1."
+        )
     for _ in inferencer.predict(dataset, rows_to_predict):
         pass  # each prediction calls `time_lines`
     table = []

@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 
+import pytest
 import torch
 
 from benchmarks import vectorize
@@ -16,9 +17,11 @@ def test_all_frames_but_the_first_are_timed_in_both_sizes(minicity_annotations, 
     checkpoint = tmp_path / "random.pth"
     torch.save(model.state_dict(), checkpoint)
     truth = minicity_annotations["val"]
-    vectorize.run(
-        Namespace(config=CONFIG, checkpoint=checkpoint, truth=truth, data_root=None, samples=1)
-    )
+    args = Namespace(config=CONFIG, checkpoint=checkpoint, truth=truth, data_root=None, samples=0)
+    with pytest.raises(ValueError, match="leave no frame after the first one: give two samples"):
+        vectorize.run(args)
+    args.samples = 1
+    vectorize.run(args)
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[-3:] if line]
     assert [row[:2] for row in rows] == [["| 100 x 200", "1"], ["| 200 x 400", "1"]]
     assert all(float(row[2]) > 0 for row in rows)
