@@ -311,12 +311,14 @@ def motion_notes(frames: Sequence[RigFrame], pose_at: PoseAt | None) -> list[str
     for frame in frames:
         for name, (_, time_ns) in frame.images.items():
             counts[name] += pose_at(time_ns) is None
-    return [
-        f"camera {name!r}: no pose is near the time of its image at {count} of "
-        f"{format_count(len(frames), 'sample')}: the motion between image and sample is neglected"
-        for name, count in counts.items()
-        if count
-    ]
+    notes = []
+    for name, count in counts.items():
+        if count:
+            notes.append(
+                f"camera {name!r}: no pose is near the time of its image at {count} of "
+                f"{format_count(len(frames), 'sample')}: the motion in between is neglected"
+            )
+    return notes
 
 
 def rig_samples(
