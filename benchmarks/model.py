@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from mmdet3d.registry import MODELS, TRANSFORMS
 from mmdet3d.structures import Det3DDataSample
-from mmengine.config import Config, DictAction
+from mmengine.config import Config
 from mmengine.structures import InstanceData
 
 from benchmarks.measure import Cost, in_own_process, markdown_table
 from gsmap.checkpoints.building import building
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakePVMask
+from gsmap.engine.arguments import OverrideAction
 from gsmap.engine.launch import read_config
 from gsmap.engine.targets import needed_targets
 from gsmap.structures.grid import BEVGrid
@@ -45,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cfg-options",
         nargs="+",
-        action=DictAction,
+        action=OverrideAction,
         metavar="KEY=VALUE",
         help="overrides of all configs, such as switches for a GPU",
     )

@@ -37,8 +37,8 @@ from comparison.results import (
     read_result,
 )
 from comparison.run_curves import plot_precision_recall
-from mmengine.config import DictAction
 
+from gsmap.engine.arguments import OverrideAction
 from gsmap.methods import METHODS
 from gsmap.utils.cli import CommandParser, EachOnce, run_command
 from gsmap.utils.errors import InputError, WorkError
@@ -71,7 +71,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--rescore",
         nargs="+",
-        action=DictAction,
+        action=OverrideAction,
         metavar="KEY=VALUE",
         help="score again with other settings, such as thresholds=[0.2,0.5,1.0]; trains nothing",
     )

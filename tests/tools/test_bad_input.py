@@ -79,6 +79,9 @@ train: C --work-dir plain.txt | plain.txt
 train: C --work-dir w --cfg-options load_from=nowhere.pth | There is no checkpoint nowhere.pth
 train: C --work-dir w --resume nowhere.pth | There is no checkpoint nowhere.pth
 train: C --work-dir w --cfg-options train_dataloader.batch_sise=2 | has no setting 'batch_sise'; did you mean 'batch_size'?
+train: C --cfg-options work_dir | argument --cfg-options: 'work_dir' is no KEY=VALUE with closed brackets
+train: C --cfg-options param_scheduler=[1,[2] | 'param_scheduler=[1,[2]' is no KEY=VALUE
+train: C --cfg-options param_scheduler=[dict(a=1,b=2)] | settings of a dictionary one by one, by KEY.NAME=VALUE
 train: C --work-dir w --cfg-options train_cfg.max_epoch=2 | has no setting 'max_epoch'; did you mean 'max_epochs'?
 train: C --work-dir w --cfg-options default_hooks.logger.intervl=2 | has no setting 'intervl'; did you mean 'interval'?
 train: C --work-dir w --cfg-options optim_wrapper.optimizer.type=AdmW | there is no optimizer of type 'AdmW'; did you mean 'AdamW'?

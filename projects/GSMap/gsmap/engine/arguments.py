@@ -11,12 +11,34 @@ from typing import Any
 from mmengine.config import DictAction
 
 
+class OverrideAction(DictAction):
+    """Store overrides ``KEY=VALUE`` in a dictionary, with a message if one cannot be parsed."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the overrides to the dictionary in the namespace."""
+        for value in values:
+            try:
+                super().__call__(parser, namespace, [value], option_string)
+            except (AssertionError, RecursionError, ValueError) as error:  # mmengine's
+                raise argparse.ArgumentError(
+                    self,
+                    f"{value!r} is no KEY=VALUE with closed brackets, such as KEY=[1,2]; override "
+                    "the settings of a dictionary one by one, by KEY.NAME=VALUE",
+                ) from error
+
+
 class _OptionAction(argparse.Action):
     """Store ``--data-root`` or ``--image-scale`` and add it to the config overrides.
 
     Overrides from ``--cfg-options`` take precedence, in any order of the options. If they come
-    first, this action keeps them. If they come later, their action (``DictAction``) extends the
-    overrides and replaces the values of equal keys.
+    first, this action keeps them. If they come later, their action (`OverrideAction`) extends
+    the overrides and replaces the values of equal keys.
     """
 
     def __call__(
@@ -54,7 +76,7 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cfg-options",
         nargs="+",
-        action=DictAction,
+        action=OverrideAction,
         metavar="KEY=VALUE",
         help="override settings, e.g. train_dataloader.batch_size=2",
     )
