@@ -138,6 +138,17 @@ def test_a_loss_reads_what_a_decoder_adds_of_the_matched_pairs():
     assert "loss_pts" not in losses
 
 
+@pytest.mark.parametrize("method", ["values", "forward", "by_layer"])
+def test_a_loss_of_another_shape_is_named(method):
+    kind = type("OddLoss", (QueryNumberLoss,), {method: lambda self, pairs: torch.zeros(3)})
+    head = small_config().map_head
+    head.losses = [{"type": kind}]
+    head = build_small(map_head=head).map_head
+    gt = straight_elements(LINE, labels=[2])
+    with pytest.raises(ValueError, match=r" must .* got the shape \((1, )?3,?\)"):
+        head.loss_by_feat(outputs_with(gt.pts, head), [gt], [{}])
+
+
 def test_the_class_loss_needs_no_compiled_op(head, monkeypatch):
     def refuse(*_, **__):
         raise RuntimeError("mmcv was built without CUDA")

@@ -118,6 +118,14 @@ def test_a_cost_that_is_not_finite_names_the_sample_and_the_cost(bad):
         assign(make_assigner(), predictions(LINE, scores=scores), ground_truth(), token="token-8")
 
 
+@pytest.mark.parametrize("shape", [(1, 2), (2,), (2, 2)])
+def test_a_cost_of_another_shape_is_named(shape):
+    assigner = make_assigner()
+    assigner.match_costs.append(lambda pred, truth, meta: torch.zeros(shape))
+    with pytest.raises(ValueError, match=r"must return the shape \(2, 1\), .* got \("):
+        assign(assigner, predictions(LINE, LINE + 0.2), ground_truth(LINE))
+
+
 def test_an_assigner_needs_a_cost():
     with pytest.raises(ValueError, match="at least one cost"):
         MapAssigner([])

@@ -5,6 +5,8 @@ from head_cases import GSMAP, HEAD, MASKS, N, build_head, with_layer
 from mmdet3d.registry import MODELS
 from torch import nn
 
+from gsmap.models.base.losses import MapLoss
+
 RASTER = {"type": "RasterLoss"}
 
 
@@ -27,6 +29,7 @@ class OldLoss(nn.Module):
             r"IoUCost needs Gaussians, got PointReference",
         ),
         ({"losses": [{"type": "OldLoss"}]}, r"OldLoss is no MapLoss: derive it from .*MapLoss"),
+        ({"losses": [{"type": MapLoss}]}, "MapLoss needs a name: a class attribute `name`"),
         ({"losses": [HEAD["losses"][0]] * 2}, "two parts have one name, 'pts'"),
         (
             {"aux_heads": [{"type": "BEVMaskHead", "name": "pts"}]},

@@ -20,6 +20,7 @@ from gsmap.models.base.masks import ElementMasks
 from gsmap.models.base.matching import MapAssigner
 from gsmap.models.base.pairs import GroundTruth, MapMatches, MatchedPairs, Predictions
 from gsmap.models.base.references import RefinedReference
+from gsmap.utils.errors import InputError
 
 Instances = Sequence[InstanceData]
 
@@ -228,13 +229,26 @@ class LossHead(DetectionHead):
 
     @staticmethod
     def _values_by_layer(loss: MapLoss, pairs: MatchedPairs) -> dict[int, Tensor]:
-        """Values of a loss, by the index of each layer that has the inputs of the loss."""
+        """Values of a loss, by the index of each layer that has the inputs of the loss.
+
+        Raises:
+            ValueError: If the loss of a layer is not one value.
+        """
         first = pairs.num_layers - 1 if loss.last_layer_only else 0
         layers = range(first, pairs.num_layers)
         layers_with_loss = [index for index in layers if loss.reads(pairs.layer(index))]
+        if not layers_with_loss:
+            return {}
         if len(layers_with_loss) == pairs.num_layers:  # all layers are computed in one call
-            return dict(enumerate(loss.by_layer(pairs)))
-        return {index: loss(pairs.layer(index)) for index in layers_with_loss}
+            values = loss.by_layer(pairs)
+        else:
+            values = torch.stack([loss(pairs.layer(index)) for index in layers_with_loss])
+        if values.shape != (len(layers_with_loss),):
+            raise InputError(
+                f"{type(loss).__name__} must return one value for each layer, got the shape "
+                f"{tuple(values.shape)} for {len(layers_with_loss)} layers."
+            )
+        return dict(zip(layers_with_loss, values, strict=True))
 
     def class_losses(self, pairs: MatchedPairs) -> Tensor:
         """Classification loss of each layer, divided by the number of pairs. (L,)"""

@@ -78,6 +78,7 @@ class MapAssigner:
         Raises:
             FloatingPointError: If a cost is not finite, or if a score of a sample without ground
                 truth is not finite.
+            ValueError: If the matrix of a cost has another shape.
         """
         num_layers = len(predictions.layers)
         num_queries = predictions.scores.shape[1] // num_layers
@@ -177,6 +178,7 @@ class MapAssigner:
 
         Raises:
             FloatingPointError: If a score of a sample without ground truth is not finite.
+            ValueError: If the matrix of a cost has another shape.
         """
         class_costs = self._class_costs(predictions)
         num_rows = predictions.scores.shape[1]
@@ -192,9 +194,11 @@ class MapAssigner:
                 continue
             for cost, by_class in zip(self.match_costs, class_costs, strict=True):
                 if by_class is None:
-                    blocks.append(cost(pred, truth, metas[index]).float())
+                    matrix = cost(pred, truth, metas[index])
+                    check_shape(cost, matrix, expected=(num_rows, count))
                 else:
-                    blocks.append(by_class[index][:, truth.labels].float())
+                    matrix = by_class[index][:, truth.labels]
+                blocks.append(matrix.float())
         blocks.append(truths.labels.float())
         values = torch.cat([block.flatten() for block in blocks]).cpu()
         host_blocks = iter(values.split([block.numel() for block in blocks]))
@@ -223,6 +227,26 @@ class MapAssigner:
             else:
                 costs.append(None)
         return costs
+
+
+def check_shape(cost: Any, matrix: Tensor, expected: tuple[int, int]) -> None:
+    """Require one value of a cost for each pair of a prediction and a ground truth.
+
+    Without this check, a transposed matrix would be read as values of other pairs.
+
+    Args:
+        cost: Built cost, for the message.
+        matrix: Matrix that it has returned.
+        expected: Number of predictions of all layers, and number of ground truths.
+
+    Raises:
+        ValueError: If the matrix has another shape.
+    """
+    if tuple(matrix.shape) != expected:
+        raise InputError(
+            f"{type(cost).__name__} must return the shape {expected}, predictions of all layers x "
+            f"ground truths, got {tuple(matrix.shape)}."
+        )
 
 
 def depends_on_class_only(cost: Any) -> bool:

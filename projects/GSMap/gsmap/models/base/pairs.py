@@ -316,7 +316,16 @@ class MatchedPairs:
         )
 
     def by_layer(self, values: Tensor) -> Tensor:
-        """Split values of the pairs by layer. (M, ...) -> (L, M / L, ...)"""
+        """Split values of the pairs by layer. (M, ...) -> (L, M / L, ...)
+
+        Raises:
+            ValueError: If there is no row for each pair.
+        """
+        if values.shape[:1] != self._rows.shape:
+            raise InputError(
+                f"values of a loss must have a row for each of the {len(self._rows)} pairs, got "
+                f"the shape {tuple(values.shape)} (GSMAP_TRACEBACK=1 shows the loss)."
+            )
         return values.unflatten(0, self._matches.rows.shape)
 
     def of_queries(self, values: Tensor) -> Tensor:

@@ -136,8 +136,11 @@ def modules_by_name(modules: Sequence[Any]) -> nn.ModuleDict:
     """Dictionary of modules by their attribute ``name``.
 
     Raises:
-        ValueError: If two modules have an equal name.
+        ValueError: If a module has no name, or two modules have an equal name.
     """
+    for module in modules:
+        if not hasattr(module, "name"):
+            raise InputError(f"{type(module).__name__} needs a name: a class attribute `name`.")
     names = [module.name for module in modules]
     check_unique_names(names, kind="parts")
     return nn.ModuleDict(dict(zip(names, modules, strict=True)))
