@@ -36,9 +36,9 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--eval",
         nargs="*",
-        choices=["chamfer", "chamfer_hard", "raster"],
-        default=["chamfer", "raster"],
-        help="metrics; without a name after it, the predictions are only written to --out",
+        metavar="METRIC",
+        help="metrics by name (default: those of the config, or chamfer and raster); without a "
+        "name after it, the predictions are only written to --out",
     )
     parser.add_argument(
         "--out", type=output_file, metavar="FILE.json", help="write the predictions (MapTR's form)"
@@ -97,11 +97,11 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
     """Apply the options of this command to the config, in place."""
     cfg.resume = False  # only weights are loaded, not the state of a training
     map_metric, *others = metric_settings(cfg)
-    map_metric = {
-        **map_metric,
-        "eval": args.eval,
-        "out_file": str(args.out) if args.out else None,
-    }
+    map_metric = dict(map_metric)
+    if args.eval is not None:
+        map_metric["eval"] = args.eval
+    if args.out:
+        map_metric["out_file"] = str(args.out)
     # `GaussianMetric` adds statistics of predicted Gaussians.
     if all(metric.get("type") != "GaussianMetric" for metric in others):
         others.append({"type": "GaussianMetric"})
@@ -120,7 +120,7 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
 
 def main() -> None:
     args = parse_args()
-    if not args.eval and not args.out:
+    if args.eval == [] and not args.out:
         raise InputError("Nothing to do: name a metric after --eval, or a file after --out.")
     from mmengine.model import is_model_wrapper
 

@@ -1,6 +1,7 @@
 """The metric class as the runner calls it: batches, ranks, padding."""
 
 import json
+from argparse import Namespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from mmengine.structures import InstanceData  # noqa: E402
 
 from gsmap.evaluation import map_metric  # noqa: E402
 from gsmap.evaluation.core.results_json import read_samples  # noqa: E402
-from tools.test import metric_settings  # noqa: E402
+from tools.test import apply_options, metric_settings  # noqa: E402
 
 RANGES = {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0)}
 
@@ -168,3 +169,19 @@ def test_the_metrics_of_a_test_are_given_as_mmengine_takes_them():
         ({"metrics": plain}, [plain]),
     ):
         assert metric_settings(Config({"test_evaluator": given})) == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, {"eval": ["chamfer"], "out_file": "a.json"}),
+        ({"eval": ["raster"]}, {"eval": ["raster"], "out_file": "a.json"}),
+        ({"eval": [], "out": "b.json"}, {"eval": [], "out_file": "b.json"}),
+    ],
+)
+def test_metrics_of_the_config_are_those_of_a_test_without_the_option(options, expected):
+    given = {"type": "MapMetric", "eval": ["chamfer"], "out_file": "a.json"}
+    cfg = Config({"test_evaluator": given})
+    nothing = {"eval": None, "out": None, "show_dir": None, "shuffle_images": None}
+    apply_options(cfg, Namespace(allow_other_split=False, **{**nothing, **options}))
+    assert cfg.test_evaluator[0] == {"type": "MapMetric", **expected}
