@@ -71,7 +71,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--check-calibration",
         type=output_file,
         metavar="FILE.png",
-        help="judge the calibration, draw the ground plane over each camera's first image, and end",
+        help="judge the calibration, draw the ground plane over the first images, and end",
     )
     parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
     parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
@@ -260,20 +260,21 @@ def require_own_samples(path: Path) -> None:
 def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
     """Print warnings about implausible properties of the cameras.
 
-    With ``--check-calibration``, also draw the ground plane over the first image of each camera.
+    With ``--check-calibration``, also draw the ground plane over the images of the first drive.
 
     Returns:
         The warnings.
     """
     samples = first_samples(source.samples)
-    sample = samples[0]
     root = source.data_root or Path()
     warnings = calibration_warnings(samples, source.frame, source.ground_z_m)
-    warnings += image_warnings(sample, root)
+    for sample in samples:
+        warnings += image_warnings(sample, root)
+    warnings = list(dict.fromkeys(warnings))  # drives of one vehicle have equal ones
     for line in warnings:
         print(f"calibration: {line}")
     if args.check_calibration:
-        figure = calibration_figure(sample, source.frame, root, source.ground_z_m)
+        figure = calibration_figure(samples[0], source.frame, root, source.ground_z_m)
         path = save_figure(figure, args.check_calibration)
         number = format_count(len(warnings), "warning")
         print(f"{number}; the ground plane as the cameras should see it: {path}")

@@ -156,7 +156,8 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     root = options.frames_dir / f"{file_name(path.stem)}-{digest}"  # `file_name` makes names safe
     sample_times_ns = {sample.timestamp_ns for sample in samples}
     sample_frames = [frame for frame in frames if frame.time_ns in sample_times_ns]
-    notes += motion_notes(sample_frames, pose_at=pose_at)
+    if pose_at is not None:
+        notes += motion_notes(sample_frames, pose_at=pose_at)
     notes += _write_images(bag, rig, frames=sample_frames, frames_dir=root)
     return Source(
         samples=samples,

@@ -3,6 +3,7 @@
 The rig is the set of cameras on a vehicle. The calibration file describes it.
 """
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -17,9 +18,10 @@ from gsmap.datasets.source import Mount, change_frame, ground_from_frame
 from gsmap.utils.errors import InputError
 from gsmap.utils.shards import WHOLE, Shard, digest
 from mapdata.folders.calibration_file import read_calibration, read_vehicle
-from mapdata.folders.rig import PoseAt, RigCamera, RigFrame, rig_samples
+from mapdata.folders.rig import RigCamera, RigFrame, motion_notes, rig_samples
 from mapdata.paths import path_below
 
+_LOGGER = logging.getLogger(__name__)
 _KEYS = {"name", "path", "timestamp_ns"}  # keys that a camera of a record may have
 _POSE = "global_from_frame"
 
@@ -36,7 +38,7 @@ def calibrated_records(
     The cameras of a record have ``name`` and ``path``. A camera has a ``timestamp_ns`` if its image
     was taken at another time than the ``timestamp_ns`` of the record. If the calibration file names
     a file of ``poses``, ``cam_from_frame`` of such a camera includes the vehicle's motion between
-    the two times.
+    the two times. A warning counts the images without a pose, for which the motion is neglected.
 
     Args:
         records: Records, as `mapdata.custom.from_records` takes them.
@@ -54,9 +56,8 @@ def calibrated_records(
     Raises:
         FileNotFoundError: If the calibration file, or its file of poses, does not exist.
         ValueError: If the file is malformed, if a camera is not in it or has a key that the file
-            defines, if a record has no pose near its time, if an image of another time has none, or
-            if a record has a pose and the file names poses, too. Also if a record in the frame
-            ``ego`` has a mounting.
+            defines, if a record has no pose near its time, or if a record has a pose and the file
+            names poses, too. Also if a record in the frame ``ego`` has a mounting.
     """
     # Images of each camera. Their size is used if the calibration file has no ``size_px``.
     images: dict[str, list[Path]] = {}
@@ -81,6 +82,7 @@ def calibrated_records(
     # frame from the frame on the road below the vehicle. It returns None if no pose is near the
     # time. Cached, since cameras often share their times.
     pose_at = None if poses is None else cache(poses.at)
+    rig_frames = []
     for number, record in shard.part(list(enumerate(records))):
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             rig_frame = _rig_frame(record, camera_of=camera_of, file=file)
@@ -92,7 +94,7 @@ def calibrated_records(
             samples = rig_samples(scene, rig, frames=[rig_frame], pose_at=pose_at)
             if not samples:  # `rig_samples` leaves out a `RigFrame` without a pose
                 raise InputError(f"{file} has no pose near timestamp_ns {rig_frame.time_ns}.")
-            _require_image_poses(rig_frame, pose_at=pose_at, file=file)
+            rig_frames.append(rig_frame)
             # `rig_samples` returns samples in the frame `ego`.
             sample = _in_frame(samples[0], record=record, meta=meta)
             completed = {**record, "ego_from_frame": sample.ego_from_frame}
@@ -109,6 +111,8 @@ def calibrated_records(
                 cameras.append(entry)
             completed["cameras"] = cameras
         yield completed
+    for note in motion_notes(rig_frames, pose_at=pose_at):
+        _LOGGER.warning(note)
 
 
 def digest_of_calibration(file: Path) -> str:
@@ -181,18 +185,6 @@ def _rig_frame(
     return RigFrame(str(record["token"]), time_ns=time_ns, images=images)
 
 
-def _require_image_poses(rig_frame: RigFrame, pose_at: PoseAt | None, file: Path) -> None:
-    """Raise a ``ValueError`` if the motion between a record and one of its images is unknown."""
-    for name, (_, time_ns) in rig_frame.images.items():
-        has_pose = pose_at is not None and pose_at(time_ns) is not None
-        if time_ns != rig_frame.time_ns and not has_pose:
-            raise InputError(
-                f"camera {name!r} has another timestamp_ns than the record, {time_ns}, without a "
-                f"pose near it, so the motion in between is unknown: add it to `poses` of {file}, "
-                "or leave timestamp_ns out to neglect the motion."
-            )
-
-
 def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta) -> MapSample:
     """Transform a sample from the frame ``ego`` to the annotation frame.
 
@@ -208,7 +200,7 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
     if ego_from_frame is None:
         mount = Mount(meta.frame, ground_z_m=ground_z_m)
     else:
-        if meta.frame == "ego" and not np.allclose(ego_from_frame, np.eye(4)):
+        if meta.frame == "ego" and not np.allclose(ego_from_frame, np.eye(4), atol=1e-4):
             raise InputError(
                 "ego_from_frame is the mounting of the frame 'lidar': leave it out in the frame "
                 "'ego', which is the vehicle."

@@ -117,7 +117,7 @@ def from_records(
         # Shards can be joined only if they are parts of one list. `source` identifies the list by
         # the tokens of all records, by `join`, and by their calibration.
         records = list(records)
-        lines = [f"join: {join}"]
+        lines = ["join"] if join else []
         for record in records:
             lines.append(str(record.get("token") if isinstance(record, Mapping) else record))
         if calibration is not None:
@@ -261,9 +261,11 @@ def _nearby_place(places: Sequence[np.ndarray], point: np.ndarray) -> np.ndarray
 
 def _require_keys(values: Mapping[str, Any], known: Sequence[str], where: str = "") -> None:
     """Raise a ``ValueError`` if a mapping has unknown keys, which would have no effect."""
-    unknown = sorted(set(values) - set(known))
+    unknown = set(values) - set(known)
     if unknown:
-        raise InputError(f"{where}unknown keys {unknown}; known are {sorted(known)}.")
+        raise InputError(
+            f"{where}unknown keys {sorted(map(str, unknown))}; known are {sorted(known)}."
+        )
 
 
 def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
@@ -343,10 +345,16 @@ def _create_record(kind: type[Record], values: Mapping[str, Any]) -> Record:
 
 def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
     """Create the record of a camera; the size comes from the image if it is not given."""
-    _require_keys(camera, known=_CAMERA_KEYS, where=f"camera {camera['name']!r}: ")
+    name = f"camera {camera['name']!r}"
+    if "timestamp_ns" in camera:
+        raise InputError(
+            f"{name}: timestamp_ns is for records with a calibration file (calibration=): leave it "
+            "out, and include the motion since the time of the sample in cam_from_frame."
+        )
+    _require_keys(camera, known=_CAMERA_KEYS, where=f"{name}: ")
     values = dict(camera)
     if camera.get("width") is None or camera.get("height") is None:
-        where = f"sample {token!r}, camera {camera['name']!r}"
+        where = f"sample {token!r}, {name}"
         path = path_below(root, name=camera["path"], noun=f"{where}: the path")
         values["width"], values["height"] = image_size(path, where)
     if np.any(camera.get("distortion", ())):  # coefficients that are all zero have no effect

@@ -140,7 +140,7 @@ def test_images_without_a_partner_are_counted(tmp_path):
     names = {"front": ["0.png", "1.png", "2.png"], "left": ["1.png", "2.png", "x.png", "y.png"]}
     source = open_input(folder_of(tmp_path / "drive", names))
     assert [len(sample.cameras) for sample in source.samples] == [1, 2, 2]
-    assert "camera 'left': 2 of 4 images used, in 2 of 3 samples; the others" in source.notes[1]
+    assert "camera 'left': 2 of 4 images used, in 2 of 3 samples; a sample has" in source.notes[1]
 
 
 def test_an_image_of_two_samples_is_counted_once(tmp_path):

@@ -323,6 +323,7 @@ def _usage_notes(
     frames: Sequence[RigFrame], images: Mapping[str, Sequence[Path]], tolerance_ns: int
 ) -> list[str]:
     """Notes on cameras with unused images, or without an image in some samples."""
+    first = next(iter(images))
     counts: Counter[str] = Counter()  # samples with an image of the camera
     used: dict[str, set[str]] = {name: set() for name in images}  # an image may be in two samples
     for frame in frames:
@@ -336,8 +337,9 @@ def _usage_notes(
         if not (all_are_used and all_have_one):
             notes.append(
                 f"camera {name!r}: {len(used[name])} of {format_count(len(paths), 'image')} used, "
-                f"in {counts[name]} of {format_count(len(frames), 'sample')}; the others have no "
-                f"partner of the same name or within {tolerance_ns / 1e6:g} ms"
+                f"in {counts[name]} of {format_count(len(frames), 'sample')}; a sample has the "
+                f"image with the name of that of {first!r}, or the nearest one within "
+                f"{tolerance_ns / 1e6:g} ms"
             )
     return notes
 

@@ -35,6 +35,7 @@ PLAIN_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "")
 # Valid numbers of distortion coefficients, by distortion model.
 _COUNTS = dict.fromkeys(PLAIN_MODELS, (4, 5, 8, 12, 14)) | dict.fromkeys(FISHEYE_MODELS, (4,))
 _LEAST_SHARE = 0.1  # smallest share of a rectified image that the original image covers
+_SAME_TIME_NS = 1_000_000  # the motion in a shorter time is negligible
 _GRID = 16  # width and height in pixels of the small image on which this share is measured
 
 
@@ -299,18 +300,17 @@ def motion_notes(frames: Sequence[RigFrame], pose_at: PoseAt | None) -> list[str
     """Notes on cameras whose motion between image and frame is unknown, so that it is neglected.
 
     Args:
-        frames: Images of the cameras at each time, for which there is a pose.
+        frames: Images of the cameras at each time. If there are poses, each frame has one.
         pose_at: Pose of the vehicle at a time in nanoseconds; None if poses are not known.
 
     Returns:
         A line for each camera with images without a pose.
     """
-    if pose_at is None:
-        return []
     counts: Counter[str] = Counter()
     for frame in frames:
         for name, (_, time_ns) in frame.images.items():
-            counts[name] += pose_at(time_ns) is None
+            if abs(time_ns - frame.time_ns) > _SAME_TIME_NS:
+                counts[name] += pose_at is None or pose_at(time_ns) is None
     notes = []
     for name, count in counts.items():
         if count:
