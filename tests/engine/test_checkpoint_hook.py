@@ -199,7 +199,7 @@ def listed(split_list: str, count: int = 1) -> Listed:
 
 
 def learn(
-    work_dir, epochs, resume_from=None, train=None, val=None, schedule=None, **options
+    work_dir, epochs, resume_from=None, train=None, val=None, schedule=None, lr=0.1, **options
 ) -> int:
     """Train for some epochs, with a validation after every second and the last; return how many."""
     Learner.validations = 0
@@ -213,7 +213,7 @@ def learn(
         train_cfg={"by_epoch": True, "max_epochs": epochs, "val_interval": 2},
         val_cfg={},
         val_evaluator=Evaluator(Nothing()),
-        optim_wrapper={"optimizer": {"type": "SGD", "lr": 0.1}},
+        optim_wrapper={"optimizer": {"type": "SGD", "lr": lr}},
         param_scheduler=schedule,
         default_hooks={"checkpoint": {"type": "AtomicCheckpointHook", "interval": 1, **options}},
         load_from=resume_from and str(resume_from),
@@ -301,6 +301,24 @@ def test_an_optimizers_state_fits_its_parameters(setting, entry, reason):
     state["state"][0].update(entry)
     with pytest.raises(ValueError, match=f"odd.pth cannot be resumed from: its .*{reason}"):
         check_optimizer_state(state, optimizer, path="odd.pth")
+
+
+@pytest.mark.parametrize(
+    ("lr", "end", "said"),
+    [
+        (0.1, 5, []),
+        (0.2, 5, ["lr 0.1 (config: 0.2)"]),
+        (0.1, 7, ["LinearLR.total_iters 4 (config: 6)", "LinearLR.end 5 (config: 7)"]),
+    ],
+)
+def test_a_resumed_run_says_which_settings_the_checkpoint_replaces(lr, end, said, tmp_path):
+    schedule = {"type": "LinearLR", "start_factor": 0.1, "end": 5}
+    start = tmp_path / "epoch_1.pth"
+    learn(tmp_path, 1, schedule=schedule)
+    learn(tmp_path, 2, start, schedule={**schedule, "end": end}, lr=lr)
+    log = "".join(path.read_text() for path in tmp_path.glob("*/*.log"))
+    assert log.count("goes on with the settings of") == bool(said)
+    assert f"goes on with the settings of {start}: {', '.join(said)}. For" in log or not said
 
 
 def test_weights_alone_cannot_be_resumed_from(tmp_path):

@@ -21,7 +21,12 @@ from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plai
 from gsmap.checkpoints.unwrapping import unwrap
 from gsmap.engine.figures import finish_checks
 from gsmap.engine.optimizers import fit_optimizer_state
-from gsmap.engine.resuming import check_optimizer_state, check_resumable, refusing_state
+from gsmap.engine.resuming import (
+    check_optimizer_state,
+    check_resumable,
+    ignored_settings,
+    refusing_state,
+)
 from gsmap.engine.run_log import innermost
 from gsmap.utils.errors import InputError, NotFiniteError
 from gsmap.utils.files import read_text, remove_link, write_bytes, write_text
@@ -167,7 +172,8 @@ class AtomicCheckpointHook(CheckpointHook):
 
         The config text, which mmengine would execute, is removed. Weights that other training loops
         stored elsewhere are moved to ``state_dict``. On resumption, the optimizer state is
-        converted to the parameter groups of this run. The split of the checkpoint is passed to the
+        converted to the parameter groups of this run, and settings of the run that it replaces are
+        logged. The split of the checkpoint is passed to the
         validation and test loops, and its calibration to the test loop.
 
         Raises:
@@ -187,14 +193,7 @@ class AtomicCheckpointHook(CheckpointHook):
             meta = {}
         meta.pop("config", None)
         if "optimizer" in checkpoint and runner._resume:
-            wrapper = runner.optim_wrapper
-            # The check needs the parameter groups of this run, so it follows the conversion.
-            fit_optimizer_state(checkpoint, wrapper=wrapper)
-            if isinstance(wrapper, OptimWrapper):  # a dict of wrappers has several optimizers
-                with refusing_state(path=source):  # a malformed state becomes a ValueError
-                    check_optimizer_state(
-                        checkpoint["optimizer"], optimizer=wrapper.optimizer, path=source
-                    )
+            self._fit_optimizer(runner, checkpoint=checkpoint)
         trained_meta = meta.get("dataset_meta")
         if isinstance(trained_meta, dict):
             # A loop is None if the run does not have it, or a dict if mmengine has not built it.
@@ -203,6 +202,29 @@ class AtomicCheckpointHook(CheckpointHook):
                     self._check_split(trained_meta, loop=loop)
         if isinstance(runner._test_loop, BaseLoop):
             _pass_model_facts(runner._test_loop, path=Path(str(source)), meta=meta)
+
+    def _fit_optimizer(self, runner: Runner, checkpoint: dict) -> None:
+        """Convert the optimizer state of a checkpoint to the parameter groups of a resumed run.
+
+        Raises:
+            ValueError: If the state does not fit the run.
+        """
+        source = runner._load_from
+        wrapper = runner.optim_wrapper
+        # The check needs the parameter groups of this run, so it follows the conversion.
+        fit_optimizer_state(checkpoint, wrapper=wrapper)
+        if isinstance(wrapper, OptimWrapper):  # a dict of wrappers has several optimizers
+            with refusing_state(path=source):  # a malformed state becomes a ValueError
+                check_optimizer_state(
+                    checkpoint["optimizer"], optimizer=wrapper.optimizer, path=source
+                )
+        ignored = ignored_settings(checkpoint, runner=runner)
+        if ignored:
+            runner.logger.warning(
+                f"The training goes on with the settings of {source}: {', '.join(ignored)}. For "
+                "those of the config, start a new one from its weights (--work-dir NEW "
+                f"--cfg-options load_from={source})."
+            )
 
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
         """Store the model's settings, the size of the scaled images and the presence of signals.

@@ -7,17 +7,20 @@ from itertools import chain
 from typing import Any
 
 from mmengine.logging import HistoryBuffer
-from mmengine.optim import _ParamScheduler
+from mmengine.optim import OptimWrapper, _ParamScheduler
 from mmengine.runner import EpochBasedTrainLoop, Runner
 from torch import Tensor
 from torch.optim import Optimizer
 
+from gsmap.checkpoints.settings import plain
 from gsmap.utils.errors import InputError
 
 _PARTS = ("meta", "message_hub", "optimizer")  # parts of a checkpoint that mmengine resumes from
 # Parts of the state of the message hub, in which mmengine stores logged values and the progress.
 _HUB_KEYS = ("log_scalars", "runtime_info", "resumed_keys")
 _SEED_COUNT = 2**32  # seeds that numpy accepts
+# Entries of the state of a schedule that are no settings: its progress and its values so far.
+_SCHEDULE_PROGRESS = {"last_step", "_global_step", "_last_value", "base_values", "verbose"}
 
 
 def refusal(path: object, reason: str) -> ValueError:
@@ -111,6 +114,38 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
             if not _fits(value, parameter=parameter):
                 reason = f"its optimizer has a {name!r:.40} that does not fit its parameter"
                 raise refusal(path, reason=reason)
+
+
+def ignored_settings(checkpoint: Mapping[str, Any], runner: Runner) -> list[str]:
+    """Settings of the optimizer and the schedules of a run that a checkpoint replaces.
+
+    mmengine restores both with their settings, so a changed setting of the config has no effect.
+
+    Args:
+        checkpoint: Content of the checkpoint, which has passed the checks of this module.
+        runner: Runner of the run.
+
+    Returns:
+        A text with both values for each setting. Several optimizers are not compared.
+    """
+    texts = []
+    if isinstance(runner.optim_wrapper, OptimWrapper):
+        groups = runner.optim_wrapper.param_groups
+        for saved, group in zip(checkpoint["optimizer"]["param_groups"], groups, strict=False):
+            for name in group:
+                # With a schedule, the rate of the config is ``initial_lr``, and ``lr`` changes.
+                is_setting = name in saved and name != "params" and f"initial_{name}" not in group
+                if is_setting and plain(saved[name]) != plain(group[name]):
+                    setting = name.removeprefix("initial_")
+                    texts.append(f"{setting} {saved[name]} (config: {group[name]})")
+    if isinstance(runner.param_schedulers, list):
+        states = checkpoint.get("param_schedulers") or []
+        for saved, schedule in zip(states, runner.param_schedulers, strict=False):
+            for name, value in schedule.state_dict().items():
+                if name not in _SCHEDULE_PROGRESS and saved.get(name) != value:
+                    kind = type(schedule).__name__
+                    texts.append(f"{kind}.{name} {saved.get(name)} (config: {value})")
+    return list(dict.fromkeys(texts))  # without repetitions: groups often differ alike
 
 
 def _fits(value: Any, parameter: Tensor) -> bool:
