@@ -71,6 +71,13 @@ def test_the_command_finds_a_metric_of_ones_own_by_its_name(own_module, scored, 
     assert figures_in(out) == pytest.approx(WANTED)
 
 
+def test_it_leaves_out_elements_of_other_classes(own_module, scored, tmp_path):
+    out = tmp_path / "metrics.json"
+    names = ["--eval", "lengths", "--custom-imports", own_module, "--classes", *CLASSES[1:]]
+    command()([*scored, *names, "--out", str(out)])
+    assert figures_in(out) == pytest.approx({name: WANTED[name] for name in list(WANTED)[1:]})
+
+
 def test_its_workers_find_it_too(own_module, scored, tmp_path):
     out = tmp_path / "metrics.json"
     names = ["--eval", "lengths", "--custom-imports", own_module, "--workers", "2"]

@@ -39,6 +39,8 @@ class _SampleFields(NamedTuple):
 class Sample(_SampleFields):
     """Predictions and ground truth of one sample, in metres in the annotation frame.
 
+    Labels are indices of the metric's classes, or -1 for elements that it must leave out.
+
     Attributes:
         token: Name of the sample.
         predictions: The N predicted elements, with scores.
