@@ -10,6 +10,7 @@ features. ``python -m benchmarks shape`` reads their predictions, ``NAME-SEED/re
 import argparse
 import json
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -95,12 +96,16 @@ def run(args: argparse.Namespace) -> None:
     # Config file and overrides of each variant, as one text, by the name of the variant.
     variants: dict[str, str] = json.loads(args.variants.read_text())
     settings = {key: str(getattr(args, key)) for key in _FIGURE_OPTIONS}
-    feature_settings = {key: settings[key] for key in _FEATURE_OPTIONS}
-    record_settings(args.out / "settings.json", feature_settings)  # of the stored features
-    for name, variant in variants.items():
-        record_settings(args.out / f"{name}.settings.json", {**settings, "variant": variant})
-    options = {"data_root": str(args.data_root)}  # the data root of each split
     feature_files = {split: args.out / f"{split}.pt" for split in ("train", "val")}
+    feature_settings = args.out / "settings.json"
+    if feature_files["train"].exists() and not feature_settings.exists():
+        raise InputError(f"{args.out} holds features of unknown settings: give another --out.")
+    settings_of_file = {feature_settings: {key: settings[key] for key in _FEATURE_OPTIONS}}
+    for name, variant in variants.items():
+        path = args.out / f"{name}.settings.json"
+        settings_of_file[path] = {**settings, "variant": variant}
+    record_settings(settings_of_file)
+    options = {"data_root": str(args.data_root)}  # the data root of each split
     for split, path in feature_files.items():
         if not path.exists():
             cfg = read_config(args.config, options)
@@ -136,21 +141,22 @@ def run(args: argparse.Namespace) -> None:
     print(markdown_table(header, rows))
 
 
-def record_settings(path: Path, settings: dict[str, str]) -> None:
-    """Write the settings of features or figures to a file, unless it has other settings.
+def record_settings(settings_of_file: Mapping[Path, dict[str, str]]) -> None:
+    """Write the settings of features and figures to files, unless one of them has other settings.
 
     Args:
-        path: JSON file.
-        settings: Values of the options that the features or figures depend on.
+        settings_of_file: Values of the options that features or figures depend on, by JSON file.
 
     Raises:
-        ValueError: If the file has other settings.
+        ValueError: If a file has other settings. No file is written then.
     """
-    if path.exists() and json.loads(path.read_text()) != settings:
-        raise InputError(
-            f"{path.parent} holds features or figures of other settings: give another --out."
-        )
-    write_text(path, json.dumps(settings, indent=1))
+    for path, settings in settings_of_file.items():
+        if path.exists() and json.loads(path.read_text()) != settings:
+            raise InputError(
+                f"{path.parent} holds features or figures of other settings: give another --out."
+            )
+    for path, settings in settings_of_file.items():
+        write_text(path, json.dumps(settings, indent=1))
 
 
 def cells(figures: dict[str, float]) -> list[str]:

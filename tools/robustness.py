@@ -210,7 +210,7 @@ def other_figures(
         raise InputError(
             f"{args.out} has figures of {', '.join(others)} of another model, other samples or "
             f"another seed (AP {before['mean']:.1f} without corruption and seed "
-            f"{before['seed']:g}, here {clean[0]['mean']:.1f} and {clean[0]['seed']:g}): give "
+            f"{before['seed']:.0f}, here {clean[0]['mean']:.1f} and {clean[0]['seed']:.0f}): give "
             "another --out, or name these --kinds too."
         )
     return others

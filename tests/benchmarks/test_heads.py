@@ -38,6 +38,9 @@ def test_variants_of_a_head_are_trained_on_stored_features(
     args.out.mkdir()
     for part in ("train", "val"):
         (tmp_path / f"{part}.pt").rename(args.out / f"{part}.pt")
+    with pytest.raises(ValueError, match="features of unknown settings: give another --out"):
+        heads.run(args)
+    (tmp_path / "settings.json").rename(args.out / "settings.json")
     heads.run(args)
     first = {path.name: path.stat().st_mtime_ns for path in args.out.glob("*-0.json")}
     assert len(first) == 3
@@ -73,4 +76,5 @@ def test_features_of_another_checkpoint_are_not_used_for_new_variants(tmp_path, 
             heads.run(args)
     with pytest.raises(ValueError, match="out holds features or figures of other settings"):
         heads.run(args)
+    assert not (tmp_path / "out/third.settings.json").exists()
     assert heads.cells(figures) == ["- / -"] * 3 + ["50.0 / 50.0"]

@@ -110,6 +110,7 @@ test: C foreign.pth --work-dir w | the checkpoint does not fit the model
 test: C maptr.pth --work-dir w | or use these parts with their initial weights: --cfg-options model.allow_untrained=True
 export: C maptr.pth --out out.onnx | was never trained with parts
 test: C K --eval | Nothing to do
+test: C K --eval chamfr --work-dir w | there is no metric ['chamfr']; there are
 test: C K --out . | Is a directory
 test: C K --work-dir w --cfg-options test_dataloader.dataset.data_root=nowhere | no annotation file at nowhere
 browse_dataset: empty.py | empty.py has no train_dataloader.dataset

@@ -35,6 +35,9 @@ def test_entries_are_read_with_commas_in_values():
     )
     nested = ("x=[[1,2],[3,4]]", "y=[(a,b),(c,d)]", "z=1")
     assert parse_entry(",".join(["b=c.py", *nested])).options == nested
+    for unbalanced in ("x=(,y=2", "x=1),y=2", "x=)(,y=2"):
+        with pytest.raises(ValueError, match="close each bracket that you open"):
+            parse_entry(f"b=c.py,{unbalanced}")
     with pytest.raises(ValueError, match="'typo' is no override; write KEY=VALUE"):
         parse_entry("b=c.py,typo")
     with pytest.raises(ValueError, match=r"got '\.\./b'"):
@@ -285,13 +288,12 @@ def test_a_test_of_some_samples_is_scored_again_on_these(minicity_annotations, t
         rescore(result, {})
 
 
-def test_seconds_a_sample_are_those_of_a_batch_divided_by_its_size(tmp_path):
+def test_seconds_of_a_test_are_those_of_a_batch_without_loading(tmp_path):
     folder = finished(tmp_path / "a", 0.2, 0.2)
-    config = folder / "test/20260101_000000/vis_data/config.py"
-    config.parent.mkdir(parents=True)
-    config.write_text("test_dataloader = dict(batch_size=4)\n")
-    (config.parents[1] / "20260101_000000.json").write_text('{"data_time": 0.2, "time": 1.0}\n')
-    assert read_result("a", folder, 0).costs == {"seconds a sample": pytest.approx(0.2)}
+    log = folder / "test/20260101_000000/20260101_000000.json"
+    log.parent.mkdir(parents=True)
+    log.write_text('{"data_time": 0.2, "time": 1.0}\n')
+    assert read_result("a", folder, 0).costs == {"seconds a test batch": pytest.approx(0.8)}
 
 
 def test_rules_of_both_metrics_may_change(minicity_annotations):

@@ -27,6 +27,7 @@ from gsmap.checkpoints.settings import differences, plain, single_dataset_of
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, find_schedulers, read_config
+from gsmap.evaluation.core.evaluator import METRIC_NAMES
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
@@ -80,7 +81,11 @@ def parse_entry(text: str) -> Entry:
 
 
 def _split_at_commas(text: str) -> list[str]:
-    """Split a text at its commas outside of brackets."""
+    """Split a text at its commas outside of brackets.
+
+    Raises:
+        ValueError: If a bracket is not closed, or closed without being open.
+    """
     parts = [""]
     depth = 0  # number of open brackets
     for character in text:
@@ -92,6 +97,10 @@ def _split_at_commas(text: str) -> list[str]:
             depth += 1
         elif character in ")]":
             depth -= 1
+            if depth < 0:
+                break
+    if depth != 0:
+        raise InputError(f"{text!r}: close each bracket that you open.")
     return parts
 
 
@@ -172,7 +181,7 @@ class Run:
             launcher += ["--standalone", "--local_addr=127.0.0.1"]  # torchrun chooses a free port
             train += ["--launcher", "pytorch"]
         test = [str(shipped_path("tools/test.py")), self.config, str(self.checkpoint)]
-        test += ["--work-dir", str(self.folder / "test")]
+        test += ["--work-dir", str(self.folder / "test"), "--eval", *METRIC_NAMES]
         test += ["--out", str(self.folder / "results.json")]
         test += ["--metrics-out", str(self.folder / "metrics.json")]
         options = ["--cfg-options", *self.options]

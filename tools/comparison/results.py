@@ -39,7 +39,7 @@ _COSTS = {  # number formats of the costs in the table, by cost
     "million parameters": ".2f",
     "seconds a step": ".3f",
     "peak MiB": ".0f",
-    "seconds a sample": ".4f",
+    "seconds a test batch": ".4f",
 }
 # Last words of the keys of statistics of batch norms, which are stored like weights.
 _BATCH_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
@@ -106,10 +106,7 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     tests = sorted(folder.glob("test/*/[0-9]*.json"))
     if tests:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])
-        batch_size = _config(folder / "test").section("test_dataloader").get("batch_size", 1)
-        costs["seconds a sample"] = (
-            timing["time"] - timing["data_time"]
-        ) / batch_size  # no loading
+        costs["seconds a test batch"] = timing["time"] - timing["data_time"]  # without loading
     if seed is None and log:
         seed = _config(folder).section("randomness").get("seed")
         if not isinstance(seed, int | None):
@@ -195,7 +192,7 @@ def check_one_test_set(results: Sequence[Result]) -> None:
         if not counts:
             raise InputError(
                 f"{result.folder}/metrics.json has no figures of {' or '.join(METRIC_NAMES)}: test "
-                "the model again (tools/test.py --metrics-out)."
+                "the model again (tools/test.py --eval chamfer raster --metrics-out)."
             )
         if first_folder is None:
             first_folder = result.folder

@@ -138,11 +138,20 @@ def test_a_loss_reads_what_a_decoder_adds_of_the_matched_pairs():
     assert "loss_pts" not in losses
 
 
-@pytest.mark.parametrize("method", ["values", "forward", "by_layer"])
-def test_a_loss_of_another_shape_is_named(method):
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("values", {}),
+        ("values", {"loss_weight": [1.0, 2.0, 3.0]}),
+        ("forward", {}),
+        ("by_layer", {}),
+        ("by_layer", {"last_layer_only": True}),
+    ],
+)
+def test_a_loss_of_another_shape_is_named(method, options):
     kind = type("OddLoss", (QueryNumberLoss,), {method: lambda self, pairs: torch.zeros(3)})
     head = small_config().map_head
-    head.losses = [{"type": kind}]
+    head.losses = [{"type": kind, **options}]
     head = build_small(map_head=head).map_head
     gt = straight_elements(LINE, labels=[2])
     with pytest.raises(ValueError, match=r" must .* got the shape \((1, )?3,?\)"):

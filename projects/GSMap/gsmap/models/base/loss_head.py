@@ -15,12 +15,11 @@ from gsmap.models.base.class_losses import ClassLoss, plain_class_loss
 from gsmap.models.base.coder import DetectionHead, Metas, Tensors
 from gsmap.models.base.groups import QueryGroup
 from gsmap.models.base.hooks import FlowHook
-from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.losses import MapLoss, check_layer_losses
 from gsmap.models.base.masks import ElementMasks
 from gsmap.models.base.matching import MapAssigner
 from gsmap.models.base.pairs import GroundTruth, MapMatches, MatchedPairs, Predictions
 from gsmap.models.base.references import RefinedReference
-from gsmap.utils.errors import InputError
 
 Instances = Sequence[InstanceData]
 
@@ -243,11 +242,7 @@ class LossHead(DetectionHead):
             values = loss.by_layer(pairs)
         else:
             values = torch.stack([loss(pairs.layer(index)) for index in layers_with_loss])
-        if values.shape != (len(layers_with_loss),):
-            raise InputError(
-                f"{type(loss).__name__} must return one value for each layer, got the shape "
-                f"{tuple(values.shape)} for {len(layers_with_loss)} layers."
-            )
+        check_layer_losses(loss, values, num_layers=len(layers_with_loss))
         return dict(zip(layers_with_loss, values, strict=True))
 
     def class_losses(self, pairs: MatchedPairs) -> Tensor:

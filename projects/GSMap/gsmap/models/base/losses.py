@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
 from gsmap.models.base.parts import WeightConfig, class_weights
-from gsmap.utils.errors import InputTypeError
+from gsmap.utils.errors import InputError, InputTypeError
 from gsmap.utils.targets import NeedsTargets
 
 
@@ -89,8 +89,9 @@ class MapLoss(nn.Module, NeedsTargets):
         """Weighted loss of one layer. Without pairs, it is 0 with a gradient of 0. ()"""
         # This is no endless recursion: `by_layer` calls `forward` only if a subclass overrides it,
         # and then this code does not run.
-        (loss,) = self.by_layer(pairs)
-        return loss
+        losses = self.by_layer(pairs)
+        check_layer_losses(self, losses, num_layers=1)
+        return losses[0]
 
     def by_layer(self, pairs: MatchedPairs) -> Tensor:
         """Weighted loss of each layer.
@@ -104,14 +105,33 @@ class MapLoss(nn.Module, NeedsTargets):
         """
         if type(self).forward is not MapLoss.forward:
             return torch.stack([self(pairs.layer(number)) for number in range(pairs.num_layers)])
-        values = self.values(pairs)
+        layer_values = pairs.by_layer(self.values(pairs))  # split by layer, (L, M / L, ...)
         has_class_weights = isinstance(self.loss_weight, Sequence)
         if has_class_weights:
-            weights = class_weights(self.loss_weight, pairs.gt_labels)
-            # The axis of the pairs is moved to the end, so that the weights (M,) are broadcast, and
-            # then back to the front.
-            values = (weights * values.movedim(0, -1)).movedim(-1, 0)
-        layer_values = pairs.by_layer(values)  # split by layer, (L, M / L, ...)
+            weights = pairs.by_layer(class_weights(self.loss_weight, pairs.gt_labels))
+            # The axes of layers and pairs are moved to the end, so that the weights (L, M / L) are
+            # broadcast, and then back to the front.
+            weighted = weights * layer_values.movedim((0, 1), (-2, -1))
+            layer_values = weighted.movedim((-2, -1), (0, 1))
         sums = layer_values.flatten(1).sum(1) / pairs.avg_factor
         # Class weights have been applied to the values above.
         return sums if has_class_weights else self.loss_weight * sums
+
+
+def check_layer_losses(loss: MapLoss, losses: Tensor, num_layers: int) -> None:
+    """Require that a loss has returned one value for each layer.
+
+    Args:
+        loss: The loss, for the message.
+        losses: What it has returned.
+        num_layers: Number of layers.
+
+    Raises:
+        ValueError: If it is no tensor, or has another shape.
+    """
+    shape = tuple(losses.shape) if isinstance(losses, Tensor) else type(losses).__name__
+    if shape != (num_layers,):
+        raise InputError(
+            f"{type(loss).__name__} must return one value for each of {num_layers} layers, got "
+            f"the shape {shape}."
+        )
