@@ -22,6 +22,7 @@ from comparison.results import (
 )
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.engine.torchrun import OWN_WORDS
 from gsmap.evaluation.core.results_json import write_results
 from gsmap.utils.faults import user_message
 
@@ -310,20 +311,29 @@ def test_rules_of_both_metrics_may_change(minicity_annotations):
 
 
 class PrintingRun(Run):
-    """A run whose training prints two errors and fails."""
+    """A run whose training prints the lines of its config's name and fails."""
 
     def commands(self) -> dict[str, list[str]]:
-        program = "print('error: the cause'); print('error: of a peer'); raise SystemExit(2)"
+        program = f"print({self.config!r}); raise SystemExit(2)"
         return {"train": [sys.executable, "-c", program], "test": []}
 
 
-def test_a_run_that_fails_says_the_first_error_of_this_attempt(tmp_path):
-    run = PrintingRun("a", 0, tmp_path / "a", "a.py", (), 1, 1, 1, {})
+@pytest.mark.parametrize(
+    ("printed", "cause"),
+    [
+        ("error: the cause\nerror: of a peer", "error: the cause"),
+        (f"[rank0]: KeyError: 'a'\nerror: rank 0 ended {OWN_WORDS}", "[rank0]: KeyError: 'a'"),
+        (f"error: the cause\nerror: rank 0 ended {OWN_WORDS}", "error: the cause"),
+        ("KeyError: 'a'", "KeyError: 'a'"),
+    ],
+)
+def test_a_run_that_fails_says_the_first_error_of_this_attempt(printed, cause, tmp_path):
+    run = PrintingRun("a", 0, tmp_path / "a", printed, (), 1, 1, 1, {})
     run.folder.mkdir()
     (run.folder / "train.log").write_text("error: of an attempt before\n")
     job = Job(run, None)
     while not job.poll():
         time.sleep(0.01)
     record = json.loads((run.folder / "run.json").read_text())
-    assert record["state"] == "train ended with exit code 2 (train.log: error: the cause)"
+    assert record["state"] == f"train ended with exit code 2 (train.log: {cause})"
     assert record["peak_mib"] > 0

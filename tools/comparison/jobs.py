@@ -17,6 +17,7 @@ import torch
 
 from comparison.plan import RECORD, SETTINGS, Run
 from gsmap.checkpoints.settings import plain
+from gsmap.engine.torchrun import OWN_WORDS
 from gsmap.utils.files import lock_folder, open_to_append, require_no_link, write_text
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.progress import Progress
@@ -134,12 +135,17 @@ class Job:
         return True
 
     def _error_message(self) -> str:
-        """First error in the output of the stage, or else its last line."""
+        """First error in the output of the stage, or else its last line.
+
+        For a rank that ended with a traceback, this is the last line of the traceback.
+        """
         text = self._log.read_bytes()[self._log_start :].decode(errors="replace")
         lines = text.splitlines()
-        errors = [line for line in lines if line.startswith("error: ")]
-        if errors:
-            return errors[0][:_MESSAGE_LENGTH]
+        for before, line in zip(["", *lines], lines, strict=False):
+            if line.startswith("error: "):
+                # After a traceback of a rank, the launcher says only which rank has failed.
+                message = before if OWN_WORDS in line else line
+                return message[:_MESSAGE_LENGTH]
         if not lines:
             return ""
         return lines[-1][:_MESSAGE_LENGTH]

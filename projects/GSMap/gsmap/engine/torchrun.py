@@ -24,6 +24,7 @@ from gsmap.utils.cli import END_SIGNALS
 from gsmap.utils.parallel import LAUNCHER
 
 INTERRUPTED = 128 + signal.SIGINT  # exit code of a process that Ctrl-C has ended
+OWN_WORDS = "(its own words stand above)"  # marks the error of a rank that has printed its own
 STOP_TIMEOUT_S = 30  # torchrun ends ranks with SIGTERM, and after this time with SIGKILL
 
 
@@ -80,7 +81,7 @@ def reason(error: ChildFailedError) -> tuple[str, int]:
         end = f"was killed ({kill.name}{hint})"
         code = 128 + kill
     else:
-        end = f"ended with {failure.exitcode} (its own words stand above)"
+        end = f"ended with {failure.exitcode} {OWN_WORDS}"
         code = failure.exitcode
     is_training = any(word.endswith("train.py") for word in sys.argv)
     remedy = "; --resume goes on from its last checkpoint" if is_training else ""
