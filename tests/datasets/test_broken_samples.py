@@ -75,6 +75,21 @@ def test_broken_samples_are_skipped_and_counted_on_demand(build, copied_root):
         dataset[1]
 
 
+def test_a_sample_that_a_transform_drops_is_named_or_counted(build, minicity_root):
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root)
+    token = build(**config).sample(0).token
+
+    def drop(results: dict) -> dict | None:
+        return None if results["token"] == token else results
+
+    config = {**config, "pipeline": [drop, *config.pipeline]}
+    with pytest.raises(BrokenSampleError, match=f"{token}': a transform .* returned None"):
+        build(**config)[0]
+    dataset = build(**config, broken_samples="skip")
+    assert dataset[0]["data_samples"].metainfo["token"] != token
+    assert list(dataset.broken_tokens) == [token]
+
+
 def test_an_absent_camera_is_named(build, minicity_annotations, minicity_root, tmp_path):
     file = AnnotationFile(minicity_annotations["val"])
     samples = list(file)
@@ -96,3 +111,15 @@ def test_nan_in_an_image_is_named(build, minicity_annotations, minicity_root):
     dataset = build(**{**config, "pipeline": [*config.pipeline[:-1], poison, config.pipeline[-1]]})
     with pytest.raises(BrokenSampleError, match="CAM_FRONT_LEFT: the image holds NaN"):
         dataset[0]
+
+
+def test_images_of_which_some_are_numbers_with_fractions_keep_their_values(build, minicity_root):
+    def brighten(results: dict) -> dict:
+        results["img"][2] = results["img"][2].astype(np.float32) + 300.5
+        return results
+
+    config = dataset_config(MINICITY, "val_dataloader", minicity_root)
+    steps = [*config.pipeline[:-1], brighten, config.pipeline[-1]]
+    images = build(**{**config, "pipeline": steps})[0]["inputs"]["img"]
+    assert images[2].min() >= 300.5
+    assert images[1].max() <= 255

@@ -517,12 +517,18 @@ class VectorizedMapDataset(BaseDataset):
             another sample at random.
 
         Raises:
-            BrokenSampleError: If a file is missing or damaged and ``broken_samples`` is ``raise``.
+            BrokenSampleError: If a file is missing or damaged, or a transform returns None, and
+                ``broken_samples`` is ``raise``.
             RuntimeError: If more than ``max_refetch`` consecutive samples are broken.
             ValueError: If an override of the command (``--cfg-options``) causes an error.
         """
         try:
             data = self.pipeline(self.get_data_info(idx))
+            if data is None:  # mmengine would take another sample in silence
+                raise BrokenSampleError(
+                    f"sample {self.sample(idx).token!r}: a transform of the pipeline returned "
+                    "None: let it return the results, or train with broken_samples='skip'."
+                )
         except BrokenSampleError as error:
             if self.broken_samples == "raise":
                 raise

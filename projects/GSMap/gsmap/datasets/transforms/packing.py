@@ -82,7 +82,8 @@ class PackMapInputs(BaseTransform):
             # steps on the GPU, and makes this strided view contiguous there.
             return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
         height, width = images[0].shape[:2]
-        stacked = np.empty((len(images), 3, height, width), dtype=images[0].dtype)
+        dtype = np.result_type(*[image.dtype for image in images])  # a transform may change some
+        stacked = np.empty((len(images), 3, height, width), dtype=dtype)
         for name, img, planes in zip(results["cam_names"], images, stacked, strict=True):
             if img.dtype.kind == "f" and not _is_finite(img):
                 raise BrokenSampleError(
