@@ -84,6 +84,7 @@ def test_a_method_becomes_the_same_head(ours, tmp_path):
     assert shapes[0] == shapes[1]
     assert heads[0].query_groups == heads[1].query_groups
     assert cfg.optim_wrapper.optimizer == wanted.optim_wrapper.optimizer
+    assert cfg.auto_scale_lr == wanted.auto_scale_lr
     assert cfg.train_cfg.max_epochs == wanted.train_cfg.max_epochs
     assert cfg.param_scheduler == wanted.param_scheduler
     assert cfg.model.img_backbone.frozen_stages == wanted.model.img_backbone.frozen_stages

@@ -30,6 +30,7 @@ FILE_SETTINGS = (
     "eval_use_same_gt_sample_num_flag padding_value queue_length box_type_3d samples_per_gpu "
     "load_interval aux_seg fixed_ptsnum_per_line"
 )
+_NUM_GPUS = 8  # for which the learning rates of the releases are
 FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # setting `z_cfg` of points without heights
 # Dotted names of settings in GSMap, by their dotted names in the upstream config. Of the schedulers
 # in `param_scheduler`, 0 is the warm-up and 1 the decay of the learning rate.
@@ -72,13 +73,15 @@ def data_settings(fields: Fields) -> dict[str, Any]:
     data_root = train.get("data_root")
     pc_range = train["pc_range"]  # smallest x, y, z, then largest x, y, z
     grid = {"x_range": [pc_range[0], pc_range[3]], "y_range": [pc_range[1], pc_range[4]]}
+    # `take` removes a setting from the config and returns its value.
+    batch_size = fields.take("data.samples_per_gpu")
     settings: dict[str, Any] = {
         "grid": grid,
         "classes": classes,
         "model.grid": grid,
         "model.classes": classes,
-        # `take` removes a setting from the config and returns its value.
-        "train_dataloader.batch_size": fields.take("data.samples_per_gpu"),
+        "train_dataloader.batch_size": batch_size,
+        "auto_scale_lr.base_batch_size": _NUM_GPUS * batch_size,
         "train_dataloader.num_workers": fields.take("data.workers_per_gpu"),
         "data_root": data_root,
         "data_set": DATASETS[train["type"]],
