@@ -303,7 +303,11 @@ def _fit_classes(
         state[key] = weights
     with_weights = summarize_names(list(old_rows))
     without_weights = summarize_names(new_classes)
-    return [f"classes keep their weights: {with_weights}; begin as new: {without_weights}."]
+    dropped = summarize_names([name for name in trained if name not in names])
+    return [
+        f"classes keep their weights: {with_weights}; begin as new: {without_weights}; are left "
+        f"out: {dropped}."
+    ]
 
 
 def _find_class_weights(
