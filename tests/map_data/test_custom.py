@@ -135,8 +135,8 @@ def test_lidar_and_signals_are_kept(tmp_path: Path):
     [
         (record(gt=[]), r"unknown keys \['gt'\]"),
         (
-            record(cameras=[{**record()["cameras"][0], "distorsion": [-0.3, 0.1, 0, 0]}]),
-            r"camera 'front': unknown keys \['distorsion'\]; known are \['cam_from_frame'",
+            record(cameras=[{**record()["cameras"][0], "distortions": [-0.3, 0.1, 0, 0]}]),
+            r"camera 'front': unknown keys \['distortions'\]; known are \['cam_from_frame'",
         ),
         (record(lidar={"path": "l.bin", "sweep": []}), r"lidar: unknown keys \['sweep'\]"),
         ({"token": "t"}, "record 't' cannot be used: it has no 'cameras'"),
