@@ -1,6 +1,7 @@
 """Corrupted calibrations are noticed, right ones pass without a word."""
 
 import re
+from argparse import Namespace
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CameraRecord
-from gsmap.datasets.source import ground_from_frame, sample_in_vehicle
+from gsmap.datasets.source import Source, ground_from_frame, sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.visualization.figure import figure_to_rgb
 from mapdata.argoverse2.log import Argoverse2Log
@@ -195,6 +196,11 @@ def test_images_of_another_size_are_noticed(town, minicity_root, tmp_path):
     Image.new("RGB", (800, 450)).save(tmp_path / camera.path)
     (line,) = image_warnings(sample, tmp_path)
     assert "has images of 800 x 450 pixels, but is calibrated for 400 x 225" in line
+    other = replace(sample, scene="other", cameras=[replace(camera, path="none.jpg")])
+    for order in ([sample, other], [other, sample]):  # of two drives, in either order
+        source = Source(order, "lidar", data_root=tmp_path)
+        found = infer.check_calibration(Namespace(check_calibration=None), source)
+        assert [text for text in found if "has images of" in text] == [line]
 
 
 def test_the_ground_is_drawn_where_the_cameras_see_it(town, minicity_root):

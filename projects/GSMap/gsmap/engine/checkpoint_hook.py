@@ -173,8 +173,8 @@ class AtomicCheckpointHook(CheckpointHook):
         The config text, which mmengine would execute, is removed. Weights that other training loops
         stored elsewhere are moved to ``state_dict``. On resumption, the optimizer state is
         converted to the parameter groups of this run, and settings of the run that it replaces are
-        logged. The split of the checkpoint is passed to the
-        validation and test loops, and its calibration to the test loop.
+        logged. The split of the checkpoint is passed to the validation and test loops, and its
+        calibration to the test loop.
 
         Raises:
             ValueError: If the run cannot be resumed from the checkpoint, if the checkpoint has no
