@@ -387,9 +387,9 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
             row.append(_cell(known_costs, form=form))
         cost_rows.append(row)
     difference_rows = []
+    num_seeds = Counter(result.name for _, result in pairs_with_first(results))  # of both configs
     for name, differences in differences_to_first(results).items():
-        num_pairs = max(map(len, differences.values()), default=0)  # seeds of both configs
-        row = [name, str(num_pairs)]
+        row = [name, str(num_seeds[name])]
         for key in columns:
             row.append(_cell(differences[key], factor=100, form="+.1f"))
         difference_rows.append(row)
