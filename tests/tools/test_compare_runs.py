@@ -49,11 +49,14 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
     config, waits = waiting_config(tiny_config, tmp_path)
     words = ["tools/compare.py", f"good={config}", "--seeds", "1"]
     words += ["--budget", "2", "--batch", "2", "--out", str(tmp_path)]
-    threads = {"OMP_NUM_THREADS": "1", **search_path()}
+    threads = {"OMP_NUM_THREADS": "2", **search_path()}  # too many, if there is a process per core
     folder = tmp_path / "good/seed_0"
     command = [sys.executable, *words]
     with subprocess.Popen(command, cwd=REPO, env={**os.environ, **threads}) as comparison:
         wait_for(folder / "epoch_1.pth", comparison)
+        for process in ranks(folder):
+            environment = Path(f"/proc/{process}/environ").read_bytes().split(b"\0")
+            assert b"OMP_NUM_THREADS=1" in environment
         comparison.send_signal(signal.SIGKILL)
     assert comparison.returncode == -signal.SIGKILL
     while ranks(folder) or not free(folder):  # training dies with it

@@ -87,7 +87,9 @@ class Job:
         """Start the process of the current stage."""
         environment = {**os.environ, "PYTHON": sys.executable}  # read by `tools/dist_run.sh`
         if self.device is None:
-            environment.setdefault("OMP_NUM_THREADS", "1")
+            # One thread for each process, also if the shell asks for more: there is a process for
+            # each core, and threads that wait for a core spin.
+            environment["OMP_NUM_THREADS"] = "1"
         else:
             environment["CUDA_VISIBLE_DEVICES"] = self.device
         with open_to_append(self._log) as log:

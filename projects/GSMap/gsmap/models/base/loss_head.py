@@ -208,13 +208,14 @@ class LossHead(DetectionHead):
         # A group may use only some of the losses. "cls" is the name of `loss_cls`.
         names = ("cls", *self.losses) if group.losses is None else group.losses
         if "cls" in names:
-            for index, value in enumerate(self.class_losses(pairs)):
-                layer_losses[index]["loss_cls"] = group.weight * value
+            for index, value in enumerate(group.weight * self.class_losses(pairs)):
+                layer_losses[index]["loss_cls"] = value
         for name, loss in cast(Any, self.losses.items()):
             applies_to_group = is_first or not loss.first_group_only
             if name in names and applies_to_group:
-                for index, value in self._values_by_layer(loss, pairs).items():
-                    layer_losses[index][f"loss_{name}"] = group.weight * value
+                values = self._values_by_layer(loss, pairs, weight=group.weight)
+                for index, value in values.items():
+                    layer_losses[index][f"loss_{name}"] = value
         if is_first:
             layer_losses[-1].update(self.statistics(pairs.layer(-1)))
         suffix = f"_{group.name}" if group.name else ""
@@ -227,8 +228,13 @@ class LossHead(DetectionHead):
         return losses
 
     @staticmethod
-    def _values_by_layer(loss: MapLoss, pairs: MatchedPairs) -> dict[int, Tensor]:
+    def _values_by_layer(loss: MapLoss, pairs: MatchedPairs, weight: float) -> dict[int, Tensor]:
         """Values of a loss, by the index of each layer that has the inputs of the loss.
+
+        Args:
+            loss: Loss of the head.
+            pairs: Matched pairs of all layers.
+            weight: Factor of the values.
 
         Raises:
             ValueError: If the loss of a layer is not one value.
@@ -243,7 +249,8 @@ class LossHead(DetectionHead):
         else:
             values = torch.stack([loss(pairs.layer(index)) for index in layers_with_loss])
         check_layer_losses(loss, values, num_layers=len(layers_with_loss))
-        return dict(zip(layers_with_loss, values, strict=True))
+        # One product of all layers is one launch on a GPU.
+        return dict(zip(layers_with_loss, weight * values, strict=True))
 
     def class_losses(self, pairs: MatchedPairs) -> Tensor:
         """Classification loss of each layer, divided by the number of pairs. (L,)"""
