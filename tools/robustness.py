@@ -16,6 +16,7 @@ import gsmap  # noqa: F401
 import argparse
 import json
 from itertools import product
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -138,9 +139,12 @@ def mean_aps(figures: dict[str, list[dict[str, float]]], kind: str) -> list[floa
 
 
 def resilience(figures: dict[str, list[dict[str, float]]], kind: str) -> float:
-    """Mean AP over the severities as a share of the AP without corruption, in percent."""
+    """Mean AP over the severities as a share of the AP without corruption, in percent.
+
+    NaN if the AP without corruption is 0.
+    """
     (clean,) = mean_aps(figures, CLEAN)  # a list of one value
-    return 100 * float(np.mean(mean_aps(figures, kind))) / max(clean, 1e-9)
+    return 100 * float(np.mean(mean_aps(figures, kind))) / clean if clean > 0 else float("nan")
 
 
 def table(figures: dict[str, list[dict[str, float]]]) -> str:
@@ -151,7 +155,8 @@ def table(figures: dict[str, list[dict[str, float]]]) -> str:
     for kind in figures:
         if kind != CLEAN:
             cells = [f"{ap:.1f}" for ap in mean_aps(figures, kind)]
-            rows.append([kind, *cells, f"{resilience(figures, kind):.0f} %"])
+            share = resilience(figures, kind)
+            rows.append([kind, *cells, "-" if isnan(share) else f"{share:.0f} %"])
     return f"AP_chamfer without corruption: {clean:.1f}\n\n{markdown_table(heads, rows)}\n"
 
 

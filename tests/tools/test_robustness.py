@@ -42,6 +42,8 @@ def test_every_kind_is_registered_and_in_the_table(tool):
     assert tool.SEVERITIES == SEVERITIES
     found = {"none": [{"mean": 40.0}], "fog": [{"mean": v} for v in (40.0, 30.0, 20.0, 10.0, 0.0)]}
     assert "| fog | 40.0 | 30.0 | 20.0 | 10.0 | 0.0 | 50 % |" in tool.table(found)
+    found["none"] = [{"mean": 0.0}]  # of which no AP is a share
+    assert "| 0.0 | - |" in tool.table(found)
 
 
 @pytest.mark.parametrize(

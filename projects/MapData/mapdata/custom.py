@@ -259,8 +259,10 @@ def _nearby_place(places: Sequence[np.ndarray], point: np.ndarray) -> np.ndarray
     return None
 
 
-def _require_keys(values: Mapping[str, Any], known: Sequence[str], where: str = "") -> None:
-    """Raise a ``ValueError`` if a mapping has unknown keys, which would have no effect."""
+def _require_keys(values: Any, known: Sequence[str], where: str = "") -> None:
+    """Raise a ``ValueError`` if a value is no mapping, or has keys that would have no effect."""
+    if not isinstance(values, Mapping):
+        raise InputError(f"{where}expected a mapping with {sorted(known)}, got {values!r:.80}.")
     unknown = set(values) - set(known)
     if unknown:
         raise InputError(
@@ -345,6 +347,8 @@ def _create_record(kind: type[Record], values: Mapping[str, Any]) -> Record:
 
 def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
     """Create the record of a camera; the size comes from the image if it is not given."""
+    if not isinstance(camera, Mapping):
+        raise InputError(f"cameras: expected a mapping for each camera, got {camera!r:.80}.")
     name = f"camera {camera['name']!r}"
     if "timestamp_ns" in camera:
         raise InputError(

@@ -38,6 +38,13 @@ def test_a_longer_gap_is_not_bridged():
     assert PoseTrack([0, 11], [np.eye(4)] * 2, gap_ns=10).at(5) is None
 
 
+def test_near_its_ends_a_longer_gap_has_a_pose_as_the_ends_of_the_track():
+    track = PoseTrack([0, 100], [pose(0.0, 0.0), pose(4.0, 0.0)], gap_ns=50)
+    at = [track.at(time_ns) for time_ns in (-6, -5, 5, 6, 94, 95, 105, 106)]
+    x = [None if found is None else found[0, 3] for found in at]
+    assert x == [None, 0.0, 0.0, None, None, 4.0, 4.0, None]
+
+
 @pytest.mark.parametrize(
     ("model", "numbers", "known"),
     [

@@ -201,9 +201,9 @@ class PoseTrack:
         times_ns: Times of the poses, in any order. Among poses of equal times, the first is used.
             (n,)
         poses: Transforms from the vehicle to the global frame, in metres. (n, 4, 4)
-        gap_ns: Longest gap between two poses in which poses are interpolated. The first pose is
-            also used up to a tenth of this time earlier, and the last pose up to a tenth of this
-            time later.
+        gap_ns: Longest gap between two poses in which poses are interpolated. In longer gaps,
+            before the first pose and after the last one, the nearest pose is used up to a tenth of
+            this time from it.
         holds: Whether poses are kept. If True, the pose before a gap longer than ``gap_ns`` is used
             in the whole gap, and the last pose is used at all later times.
 
@@ -234,18 +234,14 @@ class PoseTrack:
         after = int(np.searchsorted(self.times_ns, time_ns))  # first pose at or after the time
         if after < count and self.times_ns[after] == time_ns:
             return self.poses[after]
-        if self.holds and after == count:
-            return self.poses[-1]
-        if after in (0, count):  # before the first pose or after the last one
-            nearest = max(after - 1, 0)  # index of the first or last pose
-            is_near = abs(int(self.times_ns[nearest]) - time_ns) <= self.gap_ns // 10
-            return self.poses[nearest] if is_near else None
+        if after in (0, count) or self.times_ns[after] - self.times_ns[after - 1] > self.gap_ns:
+            if self.holds and after > 0:
+                return self.poses[after - 1]
+            return self._nearest_pose(time_ns)
         start_ns = int(self.times_ns[after - 1])
         end_ns = int(self.times_ns[after])
         start_pose = self.poses[after - 1]
         end_pose = self.poses[after]
-        if end_ns - start_ns > self.gap_ns:
-            return start_pose if self.holds else None
         share = (time_ns - start_ns) / (end_ns - start_ns)
         # Positions are interpolated linearly. The rotation is then replaced, because the weighted
         # mean of two rotation matrices is no rotation.
@@ -253,6 +249,12 @@ class PoseTrack:
         rotations = Rotation.from_matrix([start_pose[:3, :3], end_pose[:3, :3]])
         pose[:3, :3] = Slerp([0.0, 1.0], rotations)(share).as_matrix()
         return pose
+
+    def _nearest_pose(self, time_ns: int) -> np.ndarray | None:
+        """Pose at most a tenth of ``gap_ns`` from a time; None if there is none. (4, 4)"""
+        distances_ns = np.abs(self.times_ns - time_ns)
+        nearest = int(distances_ns.argmin())
+        return self.poses[nearest] if distances_ns[nearest] <= self.gap_ns // 10 else None
 
 
 @dataclass(frozen=True)
