@@ -49,8 +49,7 @@ model = dict(
                 type='Decoder', num_layers=6, return_intermediate=True,
                 transformerlayers=dict(
                     {layer},
-                    feedforward_channels=hidden, ffn_dropout={dropout},
-                    operation_order=('self_attn', 'norm', 'cross_attn', 'norm', 'ffn', 'norm')))),
+                    feedforward_channels=hidden, ffn_dropout={dropout}, operation_order={order}))),
         bbox_coder=dict(
             type='NMSFreeCoder', post_center_range={limits}, pc_range=range_m, max_num=50,
             voxel_size=[0.15, 0.15, 4], num_classes=len(map_classes)),
@@ -142,7 +141,7 @@ NUSCENES = {
     "dataset": "CustomNuScenesLocalMapDataset", "scale": 0.5, "batch": 4, "epochs": 24,
     "evaluate": 2,
     "frozen": 1, "decay": 0.01, "dropout": 0.1, "keys": "['img']", "queries": "num_vec=50,",
-    "more": "",
+    "order": "('self_attn', 'norm', 'cross_attn', 'norm', 'ffn', 'norm')", "more": "",
 }  # fmt: skip
 LIFTED = NUSCENES | {
     "range_m": "[-15.0, -30.0, -10.0, 15.0, 30.0, 10.0]", "encoder": LIFT,

@@ -54,6 +54,8 @@ def test_the_papers_configs_become_the_ones_that_are_here(ours, tmp_path):
     found = {name for name in differing if not name.startswith("_")}  # no parts of the config
     spelt_out = {  # ours has the same as a default
         "model.bev_encoder.cross_attn.num_heads",
+        "model.bev_encoder.embed_dims",
+        "model.bev_encoder.with_can_bus",
         "model.img_neck.start_level",
         "model.map_head.coder.margin_m",
         "model.map_head.decoder.layer.self_attn",
@@ -149,6 +151,45 @@ def test_what_has_no_place_is_named_with_its_value(tmp_path):
         "data.train.pipeline.6.alpha = 0.3",
         "lr_config.policy = 'step'",
     }
+
+
+@pytest.mark.parametrize(
+    ("theirs", "other", "named"),
+    [
+        ("test_mode=False", "test_mode=True", ["model.video_test_mode"]),
+        ("'Learned", "'Sine", ["model.pts_bbox_head.positional_encoding.type"]),
+        ("num_classes=len(map_classes), in", "num_classes=5, in", ["head.num_classes"]),
+        ("3, 5), num_levels=1", "3, 5), num_levels=4", ["attn_cfgs.1.attention.num_levels"]),
+        ("'norm', 'ffn', 'norm')", "'ffn', 'norm')", ["transformerlayers.operation_order"] * 2),
+        ("MultiViewImage')", "MultiViewImage', hue_delta=9)", ["train.pipeline.1.hue_delta"]),
+        ("size_divisor=32", "size=(480, 800)", ["pipeline.4.size", "transforms.1.size"]),
+        ("type='Custom", "queue_length=4, {}", ["data.train.queue_length", "val.queue_length"]),
+        ("type='Custom", "load_interval=9, {}", ["data.train.load_interval", "val.load_interval"]),
+    ],
+)
+def test_what_has_one_value_here_is_named_with_any_other(theirs, other, named, tmp_path):
+    text = upstream_configs.maptr()
+    assert theirs in text
+    _, unplaced = converted(text.replace(theirs, other.format(theirs)), tmp_path)
+    for name in named:
+        assert any(f"{name} = " in line for line in unplaced)
+
+
+def test_channels_vehicle_signals_and_distortion_arrive(tmp_path):
+    text = (
+        upstream_configs.maptr()
+        .replace("width = 256", "width = 128")
+        .replace("use_can_bus=True", "use_can_bus=False")
+        .replace("    dict(type='PhotoMetricDistortionMultiViewImage'),\n", "")
+    )
+    cfg, unplaced = converted(text, tmp_path)
+    assert unplaced == [BASE]
+    model = MODELS.build(cfg.model)
+    assert model.bev_encoder.bev_embedding.weight.shape[1] == 128
+    assert model.map_head.embed_dims == 128
+    assert model.bev_encoder.can_bus_mlp is None
+    steps = [step.type for step in cfg.train_dataloader.dataset.pipeline]
+    assert steps == ["LoadCameraImages", "ScaleImages", "FormatMapTargets", "PackMapInputs"]
 
 
 @pytest.mark.parametrize(

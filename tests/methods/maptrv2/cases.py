@@ -31,6 +31,7 @@ def upstream_config() -> str:
         "model": "MapTRv2",
         "queries": "num_vec_one2one=50, num_vec_one2many=300, k_one2many=6,",
         "layer": f"{layer}, num_vec=50, num_pts_per_vec=points",
+        "order": "('self_attn', 'norm', 'self_attn', 'norm', 'cross_attn', 'norm', 'ffn', 'norm')",
         "losses": losses + upstream_configs.SEGMENTATION,
     }
     return upstream_configs.maptr(**(upstream_configs.LIFTED | parts))

@@ -19,16 +19,15 @@ DATASETS = {
 }
 # Types of pipeline steps that GSMap does elsewhere (migration.md), or that only concern 3D boxes.
 KNOWN_STEPS = {
-    "LoadMultiViewImageFromFiles", "CustomLoadMultiViewImageFromFiles",
-    "PhotoMetricDistortionMultiViewImage", "LoadAnnotations3D", "ObjectRangeFilter",
-    "ObjectNameFilter", "PadMultiViewImage", "PadMultiViewImageDepth", "DefaultFormatBundle3D",
-    "LoadPointsFromFile", "CustomPointToMultiViewDepth",
+    "LoadMultiViewImageFromFiles", "CustomLoadMultiViewImageFromFiles", "LoadAnnotations3D",
+    "ObjectRangeFilter", "ObjectNameFilter", "DefaultFormatBundle3D", "LoadPointsFromFile",
+    "CustomPointToMultiViewDepth",
 }  # fmt: skip
 # Names of settings that annotation files contain, or that only concern history and 3D boxes.
 FILE_SETTINGS = (
     "ann_file map_ann_file classes modality test_mode use_valid_flag bev_size "
-    "eval_use_same_gt_sample_num_flag padding_value queue_length box_type_3d samples_per_gpu "
-    "load_interval aux_seg fixed_ptsnum_per_line"
+    "eval_use_same_gt_sample_num_flag padding_value box_type_3d samples_per_gpu aux_seg "
+    "fixed_ptsnum_per_line"
 )
 _NUM_GPUS = 8  # for which the learning rates of the releases are
 FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # setting `z_cfg` of points without heights
@@ -90,6 +89,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
             "FormatMapTargets": {"num_points": train["fixed_ptsnum_per_line"]},
             "MakeBEVMask": {"num_classes": len(classes)},
             "MakePVMask": {"num_classes": len(classes)},
+            "DistortImages": None if "pipeline" in train else {},
         },
         "with_depth": False,
     }
@@ -99,6 +99,8 @@ def data_settings(fields: Fields) -> dict[str, Any]:
     for part in ("train", "val", "test"):
         section = f"data.{part}"
         dataset = f"{part}_dataloader.dataset"
+        # Our files of Argoverse 2 have every fourth sample for validation, as in the releases.
+        is_every_fourth = part != "train" and settings["data_set"] == "Argoverse 2"
         settings[f"{dataset}.grid"] = grid
         settings[f"{dataset}.classes"] = classes
         settings[f"{dataset}.data_root"] = fields.take(f"{section}.data_root", default=data_root)
@@ -109,6 +111,8 @@ def data_settings(fields: Fields) -> dict[str, Any]:
             pc_range=pc_range,
             map_classes=classes,
             z_cfg=FLAT,
+            queue_length=1,
+            load_interval=4 if is_every_fourth else 1,
         )
         if "pipeline" in fields.section(section):
             # `items` lists the dotted names of the steps, such as `data.train.pipeline.0`.
@@ -138,6 +142,11 @@ def _convert_step(fields: Fields, name: str, settings: dict[str, Any]) -> None:
     elif kind == "RandomScaleImageMultiViewImage" and len(step["scales"]) == 1:
         settings["steps"]["ScaleImages"] = {"scale": step["scales"][0]}
         step.clear()
+    elif kind == "PhotoMetricDistortionMultiViewImage":
+        settings["steps"]["DistortImages"] = {}
+        fields.drop(name, names="type")
+    elif kind in ("PadMultiViewImage", "PadMultiViewImageDepth"):
+        fields.drop(name, names="type", size_divisor=32)
     elif kind == "NormalizeMultiviewImage":
         settings["model.data_preprocessor.bgr_to_rgb"] = fields.take(f"{name}.to_rgb")
         settings["model.data_preprocessor.mean"] = fields.take(f"{name}.mean")

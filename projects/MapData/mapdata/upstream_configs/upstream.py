@@ -69,17 +69,22 @@ KINDS: dict[str, tuple[str, ...]] = {
 _SELF_ATTENTIONS = ("MultiheadAttention", "GeometryDecoupledAttention")
 _CROSS_ATTENTIONS = ("CustomMSDeformableAttention",)
 _SPATIAL_ATTENTIONS = ("GeometrySptialCrossAttention", "SpatialCrossAttention")
+_ORDER = ("self_attn", "norm", "cross_attn", "norm", "ffn", "norm")  # steps of a layer
 # Settings for which GSMap supports only one value, by section. They are dropped if they have it,
 # and reported otherwise.
 FIXED_VALUES: dict[str, dict[str, Any]] = {
+    "model": {"video_test_mode": False},
     _PTS_HEAD: {
         "query_embed_type": "instance_pts", "transform_method": "minmax",
         "gt_shift_pts_pattern": "v2", "with_box_refine": True, "as_two_stage": False,
         "sync_cls_avg_factor": True, "code_size": 2, "dir_interval": 1, "z_cfg": FLAT,
     },
+    f"{_PTS_HEAD}.positional_encoding": {"type": "LearnedPositionalEncoding"},
     f"{_PTS_HEAD}.aux_seg": {"seg_classes": 1, "use_aux_seg": True},
     f"{_ENCODER}.depthnet_cfg": {"use_dcn": False, "with_cp": False},
-    f"{_SPATIAL}.attention": {"dilation": 1},
+    _PILLARS: {"operation_order": _ORDER},
+    f"{_SPATIAL}.attention": {"dilation": 1, "num_levels": 1},
+    f"{_SPATIAL}.deformable_attention": {"num_levels": 1},
     **{section: {"z_cfg": FLAT} for section in (f"{_PTS_HEAD}.bbox_coder", _TRANSFORMER, _COSTS)},
 }  # fmt: skip
 # Names of the weights of parts, by section. A part whose weight is zero has no effect and is
@@ -91,8 +96,9 @@ WEIGHTS = {
 # settings that follow from other settings or have no effect in GSMap: names separated by spaces, by
 # section
 IGNORED_NAMES = {
-    "model": "type video_test_mode",
-    _PTS_HEAD: "type num_query in_channels code_weights num_classes positional_encoding",
+    "model": "type",
+    _PTS_HEAD: "type num_query in_channels code_weights",
+    f"{_PTS_HEAD}.positional_encoding": "num_feats row_num_embed col_num_embed",
     f"{_PTS_HEAD}.bbox_coder": "type pc_range voxel_size num_classes",
     f"{_PTS_HEAD}.aux_seg": "feat_down_sample pv_thickness",
     **dict.fromkeys(
@@ -101,15 +107,15 @@ IGNORED_NAMES = {
     _TRAINING: "grid_size voxel_size point_cloud_range out_size_factor",
     _COSTS: "type pc_range",
     **dict.fromkeys([f"{_COSTS}.cls_cost", f"{_COSTS}.pts_cost"], "type"),
-    _TRANSFORMER: "type rotate_prev_bev use_shift use_can_bus embed_dims",
+    _TRANSFORMER: "type rotate_prev_bev use_shift use_can_bus",
     _ENCODER: "pc_range return_intermediate voxel_size grid_config in_channels",
-    _PILLARS: "type operation_order",
+    _PILLARS: "type",
     f"{_PILLARS}.attn_cfgs.0": "type embed_dims num_levels",
     _SPATIAL: "embed_dims pc_range num_cams",
-    f"{_SPATIAL}.attention": "type embed_dims num_levels im2col_step",
-    f"{_SPATIAL}.deformable_attention": "type embed_dims num_levels im2col_step",
+    f"{_SPATIAL}.attention": "type embed_dims im2col_step",
+    f"{_SPATIAL}.deformable_attention": "type embed_dims im2col_step",
     f"{_TRANSFORMER}.decoder": "type return_intermediate",
-    _LAYER: "operation_order num_vec num_pts_per_vec",
+    _LAYER: "num_vec num_pts_per_vec",
 }
 
 
@@ -120,13 +126,13 @@ class Conversion:
     Args:
         base: Path of the GSMap config to modify, relative to ``configs``.
         settings: Values by dotted name in GSMap. A number in a name is an index of a list.
-        steps: Settings of the steps of the data pipelines, by type of the step.
+        steps: Settings of the steps of the data pipelines, by type of the step; None removes it.
         unplaced: Settings without a counterpart in GSMap, each as ``name = value``.
     """
 
     base: str
     settings: dict[str, Any]
-    steps: dict[str, dict[str, Any]]
+    steps: dict[str, dict[str, Any] | None]
     unplaced: list[str]
 
 
@@ -219,8 +225,13 @@ def merge(conversion: Conversion, configs: Path) -> Config:
     cfg = Config(values)
     # `steps` has settings for steps of this type in all three pipelines.
     for part in ("train", "val", "test"):
-        for step in cfg[f"{part}_dataloader"].dataset.pipeline:
-            step.update(conversion.steps.get(step.type, {}))
+        dataset = cfg[f"{part}_dataloader"].dataset
+        pipeline = []
+        for step in dataset.pipeline:
+            changes = conversion.steps.get(step.type, {})
+            if changes is not None:
+                pipeline.append({**step, **changes})
+        dataset.pipeline = pipeline
     return cfg
 
 
@@ -381,6 +392,9 @@ def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[flo
         without camera parameters.
     """
     kind: str = fields.take(f"{_ENCODER}.type")
+    embed_dims = fields.take(f"{_TRANSFORMER}.embed_dims", default=256)
+    settings[_BEV + "embed_dims"] = embed_dims
+    settings[_HEAD + "embed_dims"] = embed_dims
     rows = fields.take(f"{_PTS_HEAD}.bev_h")
     columns = fields.take(f"{_PTS_HEAD}.bev_w")
     x_min, x_max, y_min, y_max = sides
@@ -402,6 +416,7 @@ def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[flo
         settings[_BEV + "aspp_channels"] = aspp_channels
         return kind
     fields.drop(_ENCODER, num_points_in_pillar=4)
+    settings[_BEV + "with_can_bus"] = fields.take(f"{_TRANSFORMER}.use_can_bus", default=True)
     settings[_BEV + "num_cams"] = fields.take(f"{_TRANSFORMER}.num_cams", default=6)
     settings |= fields.move(PILLAR_NAMES)
     _check_kind(fields, _SPATIAL, kinds=_SPATIAL_ATTENTIONS)
@@ -436,6 +451,7 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
         kind = "PointSelfAttention"
     settings[layer + "self_attn.type"] = kind
     fields.drop(self_attention, names="embed_dims num_ins num_pts")
+    fields.drop(_LAYER, operation_order=("self_attn", "norm") * len(other_attentions) + _ORDER)
     dropout = fields.section(self_attention).get("dropout")
     for attention in other_attentions:
         fields.drop(attention, names="type embed_dims", num_heads=num_heads, dropout=dropout)
@@ -452,7 +468,9 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
 
 def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
     """Convert the settings of queries and losses and add them, with the head, to ``settings``."""
-    fields.drop(_PTS_HEAD, num_pts_per_gt_vec=settings[_HEAD + "num_points"])
+    num_classes = len(settings["classes"])
+    num_points = settings[_HEAD + "num_points"]
+    fields.drop(_PTS_HEAD, num_classes=num_classes, num_pts_per_gt_vec=num_points)
     loss_cls = settings[_HEAD + "loss_cls"]
     loss_cls["type"] = f"mmdet.{loss_cls['type']}"
 
