@@ -142,7 +142,9 @@ def test_missing_and_unknown_samples_are_an_error_unless_allowed(tmp_path):
 def test_z_other_classes_and_single_points_are_said(tmp_path):
     results, truth = tmp_path / "results.json", tmp_path / "truth.json"
     line_3d = [[*point, 1.5] for point in LINE]
-    write_results(results, [("a", [vector(line_3d, "divider", 0.9), vector(LINE, "kerb", 0.5)])])
+    found = [vector(line_3d, "divider", 0.9), vector(LINE, "kerb", 0.5)]
+    short = [vector(points, "divider", 0.95) for points in ([], [[0, 0]])]
+    write_results(results, [("a", found + short)])
     write_results(
         truth, [("a", [vector(LINE, "divider"), vector([[0, 0]], "boundary")])], key="GTs"
     )
@@ -151,6 +153,7 @@ def test_z_other_classes_and_single_points_are_said(tmp_path):
     assert reports[0].metrics["chamfer/boundary/num_gts"] == 1
     text = "; ".join(notes)
     assert "z is ignored" in text
+    assert "2 predictions have fewer than two points: they are left out" in text
     assert "1 ground truths have fewer than two points" in text
     assert "1 predictions of class 'kerb' are not scored" in text
 

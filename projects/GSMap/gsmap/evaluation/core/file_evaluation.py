@@ -253,7 +253,9 @@ class SamplePairs:
             if isinstance(self._truth, SampleFile):  # `AnnotatedTruth` has the part itself
                 self._truth.left_out = self._results.left_out
         self._mismatches: list[str] = []
-        self._degenerate = 0  # number of ground truths of fewer than two points
+        # numbers of predictions and of ground truths of fewer than two points
+        self._short_predictions = 0
+        self._short_truths = 0
         # Smallest and largest x and y of the ground truth in metres.
         self._low = np.full(2, np.inf)
         self._high = np.full(2, -np.inf)
@@ -312,8 +314,9 @@ class SamplePairs:
         return self._results.about
 
     def _pair(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
-        """Create a sample, and update the count of degenerate ground truths and the bounds."""
-        self._degenerate += int((truth.num_points < 2).sum())
+        """Create a sample, and update the counts of elements without a line and the bounds."""
+        self._short_predictions += int((predictions.num_points < 2).sum())
+        self._short_truths += int((truth.num_points < 2).sum())
         if len(truth.points):
             points = np.asarray(truth.points)[:, :2]
             self._low = np.minimum(self._low, points.min(axis=0))
@@ -337,12 +340,15 @@ class SamplePairs:
         if num_with_heights and not counts_heights:
             text = "some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)"
             notes.append((0, text))
-        if self._degenerate:
+        if self._short_predictions:
+            text = "predictions have fewer than two points: they are left out"
+            notes.append((self._short_predictions, text))
+        if self._short_truths:
             text = (
                 "ground truths have fewer than two points: they count, but no prediction can match "
                 "them"
             )
-            notes.append((self._degenerate, text))
+            notes.append((self._short_truths, text))
         if canvas is not None:
             notes += [(0, note) for note in self._canvas_notes(canvas)]
         for name, number in sorted(ignored_predictions.items()):
