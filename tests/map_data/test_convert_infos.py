@@ -67,6 +67,7 @@ def annotation(sample: MapSample, classes: tuple[str, ...]) -> dict[str, list[np
     for instance in sample.instances:
         lines[classes[instance.label]].append(instance.points.astype(np.float64))
     lines["divider"].append(np.zeros((1, 2)))  # upstream's files hold such
+    lines["centerline"].append(np.zeros((2, 2)))
     return lines
 
 
@@ -130,7 +131,7 @@ def test_infos_with_maps_bring_their_truth(known, tmp_path):
 
 
 def test_elements_that_cannot_be_used_are_counted(known, damaged_root, tmp_path):
-    """A line of one node in the map, and lines of one point in a file with ground truth."""
+    """A line of one node in the map; lines of one point and of other classes in a file."""
     sample = known[0]
     file = damaged_root / f"maps/expansion/{sample.map_name}.json"
     content = json.loads(file.read_text())
@@ -142,6 +143,7 @@ def test_elements_that_cannot_be_used_are_counted(known, damaged_root, tmp_path)
     for more, reason in (
         ({}, "lane_divider without two nodes left out"),
         ({"annotation": lines}, "line of fewer than two points left out"),
+        ({"annotation": lines}, "centerline left out, which --classes does not list"),
     ):
         infos = tmp_path / "infos_train.pkl"
         infos.write_bytes(pickle.dumps({"infos": [{**nuscenes_info(sample), **more}]}, protocol=4))

@@ -322,15 +322,12 @@ def _samples(
             else:
                 sample = _nuscenes_sample(info, meta, root=root, image_sizes=image_sizes)
             check_samples([sample], meta)
+            lines_by_class = info.get("annotation") or {}
+            numbers = {name: len(lines) for name, lines in lines_by_class.items()}
         # Ground truth from a map is clipped to the range, so only ground truth of the file is
         # checked.
         if sample.instances is not None:
-            given = sum(len(info["annotation"][name]) for name in meta.classes)
-            if given > len(sample.instances):
-                count = given - len(sample.instances)
-                summary.add_problem(
-                    "line of fewer than two points left out", sample.token, count=count
-                )
+            _count_left_out(sample, meta, numbers=numbers, summary=summary)
             _check_range(sample, meta)
         elif meta.frame == "lidar":
             local_map = open_map(sample.map_name)
@@ -341,6 +338,20 @@ def _samples(
                 summary.add_problem(f"{reason} (sample kept without it)", sample.token)
         summary.add_sample(meta.split, sample)
         yield sample
+
+
+def _count_left_out(
+    sample: MapSample, meta: AnnotationMeta, numbers: dict[str, int], summary: ConversionSummary
+) -> None:
+    """Count the lines of an entry, given in ``numbers`` by class, that its sample lacks."""
+    num_short = sum(numbers[name] for name in meta.classes) - len(sample.instances or [])
+    left_out = {"line of fewer than two points left out": num_short}
+    for name, number in numbers.items():
+        if name not in meta.classes:
+            left_out[f"{name} left out, which --classes does not list"] = number
+    for reason, number in left_out.items():
+        if number:
+            summary.add_problem(reason, sample.token, count=number)
 
 
 def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
