@@ -160,7 +160,9 @@ def instance_queries(head):
 
 
 @pytest.mark.parametrize("num", [2, 6, 9])
-def test_checkpoint_with_another_number_of_further_queries(num):
+def test_checkpoint_with_another_number_of_further_queries(num, monkeypatch):
+    lines = []
+    monkeypatch.setattr("gsmap.models.base.head.print_log", lambda line, **_: lines.append(line))
     loaded = instance_queries(build(num=num)).clone()
     head = build()
     own = instance_queries(head).clone()
@@ -171,6 +173,8 @@ def test_checkpoint_with_another_number_of_further_queries(num):
     assert fitted.shape == own.shape
     assert torch.equal(fitted[:both], loaded[:both])
     assert torch.equal(fitted[both:], own[both:])
+    assert len(lines) == (len(loaded) != len(own))
+    assert all("set model.map_head.query_groups.0.num" in line for line in lines)
 
 
 def test_a_checkpoint_without_further_queries_starts_training_with_them():

@@ -302,8 +302,9 @@ class MapHead(LossHead):
         state[key] = torch.cat([common, missing])
         print_log(
             f"{key}: the checkpoint has {len(loaded)} instance queries, the model "
-            f"{len(initial)}; the {num_predicting} that predict are loaded, the others are "
-            "cut off or keep their initial values.",
+            f"{len(initial)}; the first {num_predicting}, which predict, are loaded, the others "
+            "are cut off or keep their initial values. If more of the checkpoint's predicted, set "
+            "model.map_head.query_groups.0.num to their number.",
             logger="current",
             level=logging.WARNING,
         )
