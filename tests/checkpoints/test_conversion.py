@@ -41,7 +41,8 @@ def test_a_state_survives_the_way_to_upstream_and_back():
     assert done == "maptr: gsmap to upstream"
     assert torch.equal(upstream["pts_bbox_head.code_weights"], torch.ones(4))
     back, done = convert_state(upstream)
-    assert done == "maptr: upstream to gsmap"
+    wanted = "maptr: upstream to gsmap without 1 key of no use here (pts_bbox_head.code_weights)"
+    assert done == wanted
     assert back.keys() == state.keys()
     assert all(torch.equal(back[key], state[key]) for key in state)
 

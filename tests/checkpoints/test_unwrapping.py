@@ -53,6 +53,8 @@ def test_averages_beside_their_weights_are_left_out_and_counted():
     assert unwrapped.left_out == expected
     alone = {"ema_other_weight": torch.ones(2), **STATE}
     assert "ema_other_weight" in unwrap(alone).state  # an average of no weight of the model
+    beside = {"state_dict": STATE, "ema_state_dict": with_prefix("module."), "meta": {"a": 1}}
+    assert unwrap(beside).left_out == {"weights under 'ema_state_dict'": len(STATE)}
 
 
 @pytest.mark.parametrize(

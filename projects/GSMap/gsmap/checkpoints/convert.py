@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsmap.checkpoints.key_map import find_key_map, is_upstream
 from gsmap.utils.errors import InputError
+from gsmap.utils.words import format_count
 
 _TRAINING_ONLY = "map_head.aux_heads."  # prefix of weights that only training uses
 
@@ -113,7 +114,13 @@ def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     """
     key_map = find_key_map(state)
     if is_upstream(state):
-        return ours_from_upstream(state), f"{key_map.name}: upstream to gsmap"
+        ours = ours_from_upstream(state)
+        description = f"{key_map.name}: upstream to gsmap"
+        unused = [key for key in state if key_map.is_unused(key)]
+        if unused:
+            names = summarize_names(unused)
+            description += f" without {format_count(len(unused), 'key')} of no use here ({names})"
+        return ours, description
     description = f"{key_map.name}: gsmap to upstream"
     num_left_out = 0
     for key in state:

@@ -98,6 +98,7 @@ def unwrap(content: Any) -> Unwrapped:
     for key in averages:
         del state[key]
     holder = None if entries is content else content
+    left_out |= _count_other_states(content, entries)
     return Unwrapped(state=state, holder=holder, left_out=left_out)
 
 
@@ -116,6 +117,15 @@ def _select_tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:
             raise UnfitError(f"holds no state dict of plain tensors: {key!r:.80} is another kind")
         tensors[key] = value
     return tensors
+
+
+def _count_other_states(content: Any, entries: Mapping[str, Any]) -> dict[str, int]:
+    """Count the weights in further state dicts beside ``entries``, such as averages."""
+    counts: dict[str, int] = {}
+    for name, value in content.items():
+        if value is not entries and _is_state(value) and _has_dotted_key(value):
+            counts[f"weights under {name!r:.80}"] = len(value)
+    return counts
 
 
 def _describe_contents(content: Any) -> str:
