@@ -23,6 +23,7 @@ def change(root: Path, table: str, number: int, **fields: Any) -> list[dict]:
     ("table", "fields", "message"),
     [
         ("sample", {"next": "gone"}, "sample.json has no record 'gone', to which"),
+        ("sample", {"next": ""}, "scene.json, .*nbr_samples is 2, but its links lead to 1 sample"),
         ("scene", {"log_token": "gone"}, "scene.json, record .*log_token 'gone' leads nowhere"),
         ("scene", {"first_sample_token": "x"}, "first_sample_token 'x' leads nowhere"),
         ("sample_data", {"ego_pose_token": "x"}, "sample_data.json, .*ego_pose_token 'x' leads"),
@@ -53,6 +54,15 @@ def test_a_record_that_stands_twice_is_named(options: NuScenesOptions, damaged_r
     first = change(damaged_root, "scene", 0)[0]
     change(damaged_root, "scene", 1, token=first["token"])
     with pytest.raises(ValueError, match=f"scene.json has record '{first['token']}' twice"):
+        convert_nuscenes(replace(options, root=damaged_root))
+
+
+def test_a_second_key_frame_of_a_sensor_is_named(options: NuScenesOptions, damaged_root: Path):
+    records = change(damaged_root, "sample_data", 0)
+    first = next(number for number, record in enumerate(records) if record["is_key_frame"])
+    records.append(dict(records[first], token="copy"))
+    (damaged_root / "v1.0-trainval/sample_data.json").write_text(json.dumps(records))
+    with pytest.raises(ValueError, match=r"sample_data.json has two key frames of .* for sample"):
         convert_nuscenes(replace(options, root=damaged_root))
 
 

@@ -180,7 +180,11 @@ class NuScenesTables:
         for record in sample_data:
             if record["is_key_frame"]:
                 sample = self._records["sample"][record["sample_token"]]
-                sample["data"][self._channel_of(record)] = record
+                channel = self._channel_of(record)
+                if channel in sample["data"]:
+                    problem = f" has two key frames of {channel} for sample {sample['token']!r}"
+                    raise _table_error(self._folder, "sample_data", problem=problem)
+                sample["data"][channel] = record
         self.scene = list(self._records["scene"].values())
 
     def _store(self, table: str, records: Iterable[dict[str, Any]]) -> None:
@@ -287,8 +291,21 @@ class NuScenesTables:
             token = record[step]
 
     def samples_of(self, scene: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """Yield the sample records of a scene in order of time."""
-        return self.chain("sample", scene["first_sample_token"], step="next", origin=scene)
+        """Yield the sample records of a scene in order of time.
+
+        Raises:
+            ValueError: If a link is broken, or the links do not lead to all samples of the scene.
+        """
+        number = 0
+        for sample in self.chain("sample", scene["first_sample_token"], step="next", origin=scene):
+            number += 1
+            yield sample
+        if number != scene["nbr_samples"]:
+            problem = (
+                f", record {scene['token']!r}: nbr_samples is {scene['nbr_samples']}, but its "
+                f"links lead to {format_count(number, 'sample')}"
+            )
+            raise _table_error(self._folder, "scene", problem=problem)
 
     def location_of(self, scene: dict[str, Any]) -> str:
         """Name of the map of a scene. The poses of the scene are in the frame of this map."""
