@@ -371,6 +371,15 @@ def test_a_sample_without_lidar_is_left_out_and_one_without_a_camera_kept(
     assert summary.problems["CAM_BACK absent (sample kept without it)"] == 1
 
 
+def test_missing_sweeps_are_counted_once(options: NuScenesOptions, damaged_root: Path):
+    """Neighbouring samples share sweeps; the copy has no file of any."""
+    sweeps = len(list((options.root / "sweeps/LIDAR_TOP").iterdir()))
+    summary = convert_nuscenes(replace(options, root=damaged_root, max_sweeps=10))
+    assert summary.problems["LIDAR_TOP sweep file missing"] == sweeps > 0
+    with pytest.raises(ValueError, match="max_sweeps must be >= 0, got -1"):
+        replace(options, max_sweeps=-1)
+
+
 def test_a_truncated_table_is_named_and_nothing_stays_behind(options, damaged_root: Path):
     table = damaged_root / "v1.0-trainval/ego_pose.json"
     table.write_text(table.read_text()[:-40])

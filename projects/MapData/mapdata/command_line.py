@@ -35,6 +35,9 @@ class FileOptions:
             official split of the data set.
         split_file: File that defines splits; None for a published split.
         allow_missing: Whether scenes of a published split may be missing.
+
+    Raises:
+        ValueError: If ``max_sweeps`` is negative.
     """
 
     root: Path
@@ -52,6 +55,10 @@ class FileOptions:
     split_name: str = ""
     split_file: Path | None = None
     allow_missing: bool = False
+
+    def __post_init__(self) -> None:
+        if self.max_sweeps < 0:
+            raise InputError(f"max_sweeps must be >= 0, got {self.max_sweeps}.")
 
     def meta(self, dataset: str, frame: str, split: str, **more: Any) -> AnnotationMeta:
         """Create the description of a split's annotation file.

@@ -72,6 +72,7 @@ class Argoverse2Options(FileOptions):
     y_range: tuple[float, float] = RANGES["ego"][1]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         # `pose_stride` is None for a text that is not poses:N, too.
         if self.at not in ("auto", "lidar", "cameras") and self.pose_stride is None:
             raise InputError(f"at must be auto, lidar, cameras or poses:N, got {self.at!r}.")

@@ -324,6 +324,8 @@ class _Conversion:
     def _scene_samples(self, scene_of_version: _Scene) -> list[MapSample]:
         """Read the samples of a scene without ground truth, and count missing files."""
         samples = []
+        lidar_paths = set()
+        sweep_paths: dict[str, None] = {}  # each path once: neighbouring samples share sweeps
         scene, tables = scene_of_version
         expected_cameras = set(tables.cameras)
         if expected_cameras.intersection(CAMERAS):  # a rig with cameras of nuScenes has all six
@@ -342,7 +344,12 @@ class _Conversion:
                 self._check_file(f"{camera.name} image", camera.path)
             if sample.lidar is not None:
                 self._check_file(tables.lidar, sample.lidar.path)
+                lidar_paths.add(sample.lidar.path)
+                sweep_paths.update(dict.fromkeys(sweep.path for sweep in sample.lidar.sweeps))
             samples.append(sample)
+        for path in sweep_paths:
+            if path not in lidar_paths:  # an earlier key frame is counted above
+                self._check_file(f"{tables.lidar} sweep", path)
         return samples
 
     def _check_file(self, name: str, path: str) -> None:
