@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow.feather as feather
 import pytest
 from argoverse2_road import (
     IMAGE_EVERY_NS,
@@ -214,6 +215,27 @@ def test_bad_logs_are_left_out_with_their_reason_and_the_rest_goes_on(tmp_path):
         assert name in summary
 
 
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("intrinsics", "fx_px", np.nan),
+        ("intrinsics", "fy_px", -1000.0),
+        ("intrinsics", "width_px", 0),
+        ("egovehicle_SE3_sensor", "tx_m", np.inf),
+    ],
+)
+def test_an_impossible_calibration_leaves_its_log_out(tmp_path, table, column, value):
+    for name in ("log-bad", "log-good"):
+        write_log(tmp_path / "val" / name)
+    path = tmp_path / f"val/log-bad/calibration/{table}.feather"
+    values = feather.read_feather(path)
+    values.loc[values["sensor_name"] == "ring_side_left", column] = value
+    feather.write_feather(values, path)
+    summary, file = convert(tmp_path)
+    assert {s.scene for s in file} == {"log-good"}
+    assert "log-bad/calibration cannot be used: the calibration of ring_side_left" in summary
+
+
 def test_logs_known_to_be_unfit_are_left_out(tmp_path):
     broken, changed = next(iter(BROKEN_LOGS)), next(iter(MAP_CHANGE_LOGS))
     for name in ("log-a", broken, changed):
@@ -239,8 +261,15 @@ def test_logs_can_be_chosen_by_how_they_begin(tmp_path):
     _, file = convert(tmp_path, logs=("a",))
     assert sorted({s.scene for s in file}) == ["aa-1", "ab-2"]
     assert file[0].cameras[0].path.startswith("sensor/val/aa-1/")
-    with pytest.raises(FileNotFoundError, match="begins with 'zz'"):
-        convert(tmp_path, logs=("zz",))
+    own = tmp_path / "own.json"
+    own.write_text(json.dumps({"val": ["aa-1", "ab-2"]}))
+    for split_file in (None, own):
+        with pytest.raises(FileNotFoundError, match="begins with 'zz'"):
+            convert(tmp_path, logs=("aa", "zz"), split_file=split_file)
+    _, file = convert(tmp_path, logs=("aa",), split_file=own)
+    assert {s.scene for s in file} == {"aa-1"}
+    with pytest.raises(ValueError, match="max_sweeps must be >= 0, got -1"):
+        convert(tmp_path, max_sweeps=-1)
     with pytest.raises(FileNotFoundError, match="--root must name the folder"):
         convert(tmp_path, split="train")
 

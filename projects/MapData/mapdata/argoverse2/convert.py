@@ -16,7 +16,13 @@ from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import SPLIT_LIST
-from mapdata.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_all_logs, find_logs
+from mapdata.argoverse2.log import (
+    BROKEN_LOGS,
+    MAP_CHANGE_LOGS,
+    chosen_logs,
+    find_all_logs,
+    find_logs,
+)
 from mapdata.argoverse2.map import COMPAT_MODES, DEFAULT_RULES
 from mapdata.argoverse2.samples import (
     THIN_OVER,
@@ -150,15 +156,11 @@ def _listed_logs(
             allowed=options.allow_missing,
         )
         summary.notes.append(note)
-    log_dirs = []
-    for name in sorted(listed.intersection(part_by_name)):
-        if not options.logs or name.startswith(tuple(options.logs)):
-            log_dirs.append(log_by_name[name])
+    log_dirs = [log_by_name[name] for name in sorted(listed.intersection(part_by_name))]
+    where = f"part {options.split!r} of split {split_list.name!r} in {options.root}"
     if not log_dirs:
-        raise FileNotFoundError(
-            f"{options.root} has none of the requested logs of split {split_list.name!r}."
-        )
-    return log_dirs
+        raise FileNotFoundError(f"no log of {where}.")
+    return chosen_logs(log_dirs, options.logs, where=where)
 
 
 def _worker_count(options: Argoverse2Options, log_dirs: Sequence[Path]) -> int:

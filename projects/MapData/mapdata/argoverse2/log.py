@@ -11,7 +11,7 @@ from av2.geometry.geometry import quat_to_mat
 from av2.utils.synchronization_database import SynchronizationDB
 
 from gsmap.datasets.errors import explain_errors
-from gsmap.structures.rigid import rigid
+from gsmap.structures.rigid import is_rigid, rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import SUFFIX as PARTIAL_SUFFIX
 from mapdata.arrow_tables import read_table
@@ -47,6 +47,15 @@ def _read_feather(path: Path) -> Any:
         ArrowException: If the table is damaged.
     """
     return read_table(path).to_pandas()
+
+
+def _check_camera(camera: PinholeCamera) -> None:
+    """Raise a ``ValueError`` for sizes, focal lengths or a pose that no camera can have."""
+    lens = camera.intrinsics
+    positive = (lens.fx_px, lens.fy_px, lens.width_px, lens.height_px)
+    has_lens = np.isfinite(lens.K).all() and min(positive) > 0
+    if not (has_lens and is_rigid(camera.ego_SE3_cam.transform_matrix)):
+        raise InputError(f"the calibration of {camera.cam_name} has invalid values")
 
 
 class Argoverse2Log:
@@ -107,7 +116,7 @@ class Argoverse2Log:
         """Calibrated ring cameras by name; empty if the log has no calibration.
 
         Raises:
-            ValueError: If a calibration file is damaged.
+            ValueError: If a calibration file is damaged, or its values are no camera.
         """
         folder = self.log_dir / "calibration"
         intrinsics_path = folder / "intrinsics.feather"
@@ -122,6 +131,7 @@ class Argoverse2Log:
             for name in RING_CAMERAS:
                 if name in calibrated_names:
                     cameras[name] = PinholeCamera.from_feather(self.log_dir, name)
+                    _check_camera(cameras[name])
         return cameras
 
     @cached_property
@@ -180,11 +190,28 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
             "(https://www.argoverse.org/av2.html#download-link)."
         )
     log_dirs = _logs_of_split(folder)
+    if not log_dirs and not logs:
+        raise FileNotFoundError(f"no Argoverse 2 log in {folder}.")
+    return chosen_logs(log_dirs, logs, where=str(folder))
+
+
+def chosen_logs(log_dirs: list[Path], logs: Sequence[str], where: str) -> list[Path]:
+    """Select logs by their ids.
+
+    Args:
+        log_dirs: Folders of the logs.
+        logs: Ids, or first characters of ids; an empty sequence takes all logs.
+        where: Place of the logs, for messages.
+
+    Returns:
+        The selected folders in their order.
+
+    Raises:
+        FileNotFoundError: If no id begins with one of ``logs``.
+    """
     for prefix in logs:
         if not any(path.name.startswith(prefix) for path in log_dirs):
-            raise FileNotFoundError(f"no log in {folder} begins with {prefix!r}.")
-    if not log_dirs:
-        raise FileNotFoundError(f"no Argoverse 2 log in {folder}.")
+            raise FileNotFoundError(f"no log in {where} begins with {prefix!r}.")
     if not logs:
         return log_dirs
     return [path for path in log_dirs if path.name.startswith(tuple(logs))]
