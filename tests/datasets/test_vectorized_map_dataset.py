@@ -324,6 +324,34 @@ def test_it_repeats_and_goes_through_workers(build, minicity_root, minicity_anno
     assert batches[0]["inputs"]["img"][0].shape == (6, 3, 90, 160)
 
 
+def test_data_sets_of_other_cars_are_joined_and_other_classes_are_named(
+    build, minicity_root, minicity_annotations, tmp_path
+):
+    """The images of the other car are 8 pixels wider, and its LiDAR is mounted 0.1 m higher."""
+    from mmdet3d.registry import DATASETS
+
+    source = AnnotationFile(minicity_annotations["train"])
+    samples = []
+    for sample in source:
+        cameras = [replace(camera, width=camera.width + 8) for camera in sample.cameras]
+        mounting = sample.ego_from_frame.copy()
+        mounting[2, 3] += 0.1
+        samples.append(replace(sample, cameras=cameras, ego_from_frame=mounting))
+    first = {"type": "VectorizedMapDataset", "ann_file": str(minicity_annotations["train"])}
+    other = {**first, "ann_file": str(tmp_path / "other.arrow")}
+    joined = {"type": "ConcatDataset", "datasets": [first, other]}
+    write_annotations(tmp_path / "other.arrow", source.meta, samples)
+    assert len(DATASETS.build(joined)) == 2 * len(source)
+    meta = replace(source.meta, classes=("boundary", "divider", "ped_crossing"), split="val")
+    write_annotations(tmp_path / "other.arrow", meta, samples)
+    message = r"data sets 1 and 2 of ConcatDataset differ in 'classes': \('divider', .*'boundary', "
+    with pytest.raises(ValueError, match=message):
+        DATASETS.build(joined)
+    with pytest.raises(ValueError, match=r"'split': 'train' and 'val'.*ignore_keys=\['split'\]"):
+        DATASETS.build({**joined, "ignore_keys": "classes"})
+    assert len(DATASETS.build({**joined, "ignore_keys": ["classes", "split"]})) == 2 * len(source)
+
+
 def test_it_tests_without_ground_truth_and_refuses_to_train(
     build, minicity_root, minicity_annotations, tmp_path
 ):

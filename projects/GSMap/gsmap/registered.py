@@ -10,6 +10,7 @@ from gsmap.utils.collection import pause_collection
 # module is imported.
 MODULES = (
     "gsmap.apis.rig_fit",
+    "gsmap.datasets.concatenation",
     "gsmap.datasets.stream_samplers",
     "gsmap.datasets.vectorized_map_dataset",
     "gsmap.engine.checkpoint_hook",
