@@ -28,6 +28,7 @@ CAMERAS = {"CAM_FRONT": "/front", "CAM_BACK": "/rear"}
 VEHICLE = "base_footprint"  # x ahead, y left, on the road below the rear axle
 MIN_SCORE = 0.3
 PERIOD_S = 0.5
+MAX_DELAY_S = 0.1  # largest time by which an image may be older than the newest one
 # Encodings of images that the node takes, and the slice of the channels red, green and blue.
 RGB = slice(0, 3)
 BGR = slice(2, None, -1)
@@ -42,7 +43,8 @@ class MapNode(Node):
     def __init__(self) -> None:
         super().__init__("gsmap")
         self.inferencer = MapInferencer(MODEL)
-        self.live = None  # function from images to map elements, made once the cameras are known
+        self.live = None  # function from images to map elements, made for the calibration
+        self.projections = {}  # projection matrices that `live` was made for, by camera
         self.images = {}  # latest Image message of each camera, by the name of the camera
         self.infos = {}  # latest CameraInfo message of each camera
         for name, topic in CAMERAS.items():
@@ -76,10 +78,19 @@ class MapNode(Node):
         return rigid(rotation, [shift.x, shift.y, shift.z])
 
     def step(self) -> None:
-        """Predict and publish the map, once every camera has sent an image and its CameraInfo."""
+        """Predict and publish the map, if every camera has sent a new image and its CameraInfo."""
         if len(self.images) < len(CAMERAS) or len(self.infos) < len(CAMERAS):
+            missing = sorted(set(CAMERAS) - (self.images.keys() & self.infos.keys()))
+            self.get_logger().warning(f"no map: no new image or no CameraInfo of {missing}")
             return
-        if self.live is None:
+        images = self.images.copy()
+        newest_s = max(map(seconds, images.values()))
+        late = [name for name in images if newest_s - seconds(images[name]) > MAX_DELAY_S]
+        if late:
+            self.get_logger().warning(f"no map: the images of {late} are late")
+            return
+        projections = {name: tuple(info.p) for name, info in self.infos.items()}
+        if projections != self.projections:  # also at the first images
             intrinsics = {}
             mounting = {}
             for name, info in self.infos.items():
@@ -97,13 +108,21 @@ class MapNode(Node):
             self.live = self.inferencer.live(
                 intrinsics, cam_from_frame=mounting, frame="vehicle", allow_missing_cameras=True
             )
-        elements = self.live({name: rgb(message) for name, message in self.images.items()})
+            self.projections = projections
+        self.images.clear()  # so that a camera that stops does not lend an old image to a later map
+        elements = self.live({name: rgb(message) for name, message in images.items()})
         confident = elements.select(elements.confidence > MIN_SCORE)
         # The images may have slightly different times. The time of one of them stands for all.
-        stamp = next(iter(self.images.values())).header.stamp
+        stamp = next(iter(images.values())).header.stamp
         # A viewer keeps old markers until they are erased.
         erase = Marker(action=Marker.DELETEALL)
         self.publisher.publish(MarkerArray(markers=[erase, *markers(confident, stamp)]))
+
+
+def seconds(message: Any) -> float:
+    """Time of a message."""
+    stamp = message.header.stamp
+    return float(stamp.sec + stamp.nanosec / 1e9)
 
 
 def rgb(message: Any) -> np.ndarray:

@@ -141,13 +141,22 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
     node = scope["MapNode"]()
     node.step()
     assert node.published == []  # no camera has spoken
+    assert (
+        node.warnings.pop() == "no map: no new image or no CameraInfo of ['CAM_BACK', 'CAM_FRONT']"
+    )
     pixels = np.random.default_rng(0).integers(0, 256, (225, 410, 3), np.uint8)
-    for place in ("front", "rear"):
-        header = Message(frame_id=f"{place}_optical", stamp=7)
+    p = [320.0, 0, 200, 0, 0, 320, 112, 0, 0, 0, 1, 0]
+
+    def send(place, second, p=p):
+        stamp = Message(sec=second, nanosec=5)
+        header = Message(frame_id=f"{place}_optical", stamp=stamp)
         shape = {"height": 225, "width": 400, "step": 3 * 410, "encoding": "bgr8"}
         node.topics[f"/{place}/image_rect"](Message(header=header, data=pixels.tobytes(), **shape))
-        p = [320.0, 0, 200, 0, 0, 320, 112, 0, 0, 0, 1, 0]
         node.topics[f"/{place}/camera_info"](Message(header=header, p=p))
+        return header
+
+    send("front", 7)
+    header = send("rear", 7)
     image = scope["rgb"](node.images["CAM_FRONT"])
     np.testing.assert_array_equal(image, pixels[:, :400, ::-1])
     for encoding, channels in {"rgba8": [2, 1, 0, 3], "bgra8": [0, 1, 2, 3]}.items():
@@ -171,8 +180,22 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
     assert node.warnings == ["no transform to camera CAM_FRONT yet: unknown frame"]
     node.transforms.filled = True
     node.step()
+    send("front", 8)
+    send("rear", 8)
     node.step()
     ((intrinsics, mounting, frame),) = rigs  # fitted once
+    send("front", 9)
+    node.step()  # without a new image of the rear camera
+    send("rear", 8)
+    node.step()  # with an image that is late
+    assert node.warnings[1:] == [
+        "no map: no new image or no CameraInfo of ['CAM_BACK']",
+        "no map: the images of ['CAM_BACK'] are late",
+    ]
+    assert len(node.published) == 2
+    send("rear", 9, p=[640.0, *p[1:]])
+    node.step()
+    assert rigs[1][0]["CAM_BACK"][0, 0] == 640  # the calibration has changed
     np.testing.assert_array_equal(intrinsics["CAM_BACK"], np.reshape(p, (3, 4))[:, :3])
     place = np.linalg.inv(mounting["CAM_BACK"])[:3, [2, 3]]  # looks back, where it is
     np.testing.assert_allclose(place.T, [[-1, 0, 0], [-2, 0, 1.5]], atol=1e-12)
@@ -181,5 +204,5 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
     assert erase.action == Message.DELETEALL
     assert len(lines) > 10
     assert {line.header.frame_id for line in lines} == {"base_footprint"}
-    assert all(len(line.points) == 20 and line.header.stamp == 7 for line in lines)
+    assert all(len(line.points) == 20 and line.header.stamp.sec == 8 for line in lines)
     assert max(abs(point.x) for line in lines for point in line.points) > 20  # ahead is x
