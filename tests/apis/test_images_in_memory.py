@@ -1,6 +1,9 @@
 """Images in memory, one sample and live, on a small MapTR with random weights."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import cv2
 import numpy as np
@@ -8,7 +11,7 @@ import pytest
 import torch
 from inferencer_cases import drive, make_remembering, make_samples
 
-from gsmap.datasets.source import change_frame, ground_from_frame
+from gsmap.datasets.source import Source, change_frame, ground_from_frame
 from gsmap.structures.rigid import rigid
 from gsmap.structures.streams import Frame
 from gsmap.visualization.figure import figure_to_rgb
@@ -74,6 +77,35 @@ def test_a_live_rig_sees_each_frame_as_if_it_were_alone(inferencer, tmp_path, mo
     small = {name: image[::2, ::2] for name, image in frames[0][0].items()}
     alone = inferencer.elements(inferencer.predict_images(small, *frames[0][1:]))
     np.testing.assert_array_equal(live(small).points, alone.points)  # of another size
+
+
+def test_threads_that_share_a_live_rig_get_maps_of_their_images(inferencer, tmp_path, monkeypatch):
+    frames = [in_memory(sample, tmp_path) for sample in make_samples(tmp_path, 2)]
+    live = inferencer.live(*frames[0][1:])
+    alone = [live(images).points for images, *_ in frames]
+    assert abs(alone[0] - alone[1]).max() > 1e-3
+    predict = inferencer.predict
+
+    def slowly(*args, **options):
+        time.sleep(0.1)  # in which the other thread begins its frame
+        return predict(*args, **options)
+
+    monkeypatch.setattr(inferencer, "predict", slowly)
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda frame: live(frame[0]).points, frames))
+    np.testing.assert_array_equal(found, alone)
+
+
+def test_threads_that_open_samples_at_once_write_files_of_their_own(
+    inferencer, tmp_path, monkeypatch
+):
+    samples = make_samples(tmp_path, 2)
+    sources = [Source([sample], frame="lidar", data_root=tmp_path) for sample in samples]
+    both = Barrier(2)
+    monkeypatch.setattr(inferencer, "_warn_about_real_images", lambda source: both.wait(10))
+    with ThreadPoolExecutor(2) as pool:
+        files = list(pool.map(lambda source: inferencer.dataset(source).ann_file, sources))
+    assert len(set(files)) == 2
 
 
 def test_a_live_rig_takes_the_signals_of_the_vehicle(inferencer, tmp_path):

@@ -1,6 +1,7 @@
 """Predictions of a trained model from the camera images of one vehicle, frame by frame."""
 
 import logging
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -71,7 +72,8 @@ class LiveMap:
 
     Use ``MapInferencer.live`` to create it. The calibration is prepared at the first frame, and
     again if an image size changes. Frames are independent of each other unless a stream is given. A
-    stream is the memory of a temporal model between frames.
+    stream is the memory of a temporal model between frames. Several threads may call a `LiveMap`;
+    it predicts one frame at a time.
 
     Args:
         inferencer: The trained model.
@@ -113,6 +115,7 @@ class LiveMap:
         self._cam_from_frame = cam_from_frame
         self._frame = frame or self._config.get("frame") or "lidar"  # frame of the calibration
         self._allow_missing_cameras = allow_missing_cameras
+        self._lock = threading.Lock()  # held while the data set has the images of a frame
         self._sizes: dict[str, tuple[int, ...]] = {}  # shape of the last image of each camera
         self._logged_warnings: set[str] = set()
         # Set by `_prepare`: the data set of one sample, and the transform from the annotation frame
@@ -191,6 +194,17 @@ class LiveMap:
         if can_bus is not None and not np.isfinite(can_bus).all():
             raise InputError(f"can_bus must be finite, got {can_bus}.")
         pixels = bgr_by_name(images)
+        with self._lock:
+            return self._predict_frame(pixels, can_bus=can_bus, at=at, stream=stream)
+
+    def _predict_frame(
+        self,
+        pixels: dict[str, np.ndarray],
+        can_bus: np.ndarray | None,
+        at: Frame | None,
+        stream: MapStream | None,
+    ) -> "Det3DDataSample":
+        """Predict one frame, with checked BGR images and arguments as in `predict`."""
         sizes = {name: image.shape for name, image in pixels.items()}
         if sizes != self._sizes:  # also at the first frame
             self._prepare(pixels)

@@ -4,6 +4,7 @@ import copy
 import logging
 import tempfile
 import threading
+import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -171,9 +172,8 @@ class MapInferencer:
         # again if a weight moves.
         self._rig_embeds: dict[Any, tuple[Any, torch.nn.Parameter]] = {}
         self.visualizer = _build_visualizer(self.cfg)
-        # Folder of the annotation files that `dataset` writes, and the number of these files.
+        # Folder of the annotation files that `dataset` writes.
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
-        self._num_files = 0
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_locks": None}  # locks cannot be copied
@@ -236,7 +236,6 @@ class MapInferencer:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file cannot be used with this config.
         """
-        self._num_files += 1
         root = None if data_root is None else Path(data_root)
         mount = self.model.mount  # annotation frame of the model, and its pose on the vehicle
         if isinstance(source, str | Path):
@@ -245,7 +244,7 @@ class MapInferencer:
             self._warn_about_real_images(source)
         else:
             source = Source(source, frame=mount.frame, data_root=root, ground_z_m=mount.ground_z_m)
-        ann_file = Path(self._scratch.name) / f"samples{self._num_files}.arrow"
+        ann_file = Path(self._scratch.name) / f"{uuid.uuid4().hex}.arrow"
         dataset = open_dataset(self.cfg, source=source, mount=mount, ann_file=ann_file)
         self.visualizer.dataset_meta = dataset.metainfo
         return dataset
