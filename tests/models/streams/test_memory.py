@@ -181,6 +181,13 @@ def test_a_sample_without_a_pose_is_named():
             step(head, memory, meta(0, lidar2global=wrong))
 
 
+@pytest.mark.parametrize("time", [1.6e9, np.float64(1.6e18), None, "0"])
+def test_a_time_that_is_no_integer_is_refused(time):
+    with pytest.raises(TypeError, match="timestamp_ns of sample 'a' must be an integer of nanosec"):
+        Frame("a", "scene", time, np.eye(4))
+    assert Frame("a", "scene", np.int64(7), np.eye(4)).timestamp_ns == 7
+
+
 def test_slots_start_anew_where_a_sample_does_not_follow():
     slots = Slots(max_gap_s=2.0)
     slots.keep([StreamState(Frame.from_meta(meta(4, scene))) for scene in "abcd"])

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmap.structures.rigid import invert_rigid, is_rigid
-from gsmap.utils.errors import InputError
+from gsmap.utils.errors import InputError, InputTypeError
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class Frame:
         pose: Transform from the annotation frame to the world in metres. (4, 4)
 
     Raises:
+        TypeError: If the time is no integer.
         ValueError: If the pose is no finite rigid motion (4, 4).
     """
 
@@ -41,6 +42,11 @@ class Frame:
     pose: NDArray[np.float64]
 
     def __post_init__(self) -> None:
+        if not isinstance(self.timestamp_ns, int | np.integer):
+            raise InputTypeError(
+                f"timestamp_ns of sample {self.token!r} must be an integer of nanoseconds, got "
+                f"{self.timestamp_ns!r}."
+            )
         pose = np.asarray(self.pose)
         if pose.shape != (4, 4) or not is_rigid(pose):
             raise InputError(
@@ -70,7 +76,7 @@ class Frame:
         return cls(
             token=str(meta.get("token")),
             scene=str(meta["scene"]),
-            timestamp_ns=int(meta["timestamp_ns"]),
+            timestamp_ns=meta["timestamp_ns"],
             pose=np.asarray(meta["lidar2global"], np.float64),
         )
 
