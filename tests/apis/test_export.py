@@ -257,6 +257,10 @@ def test_wrong_images_and_matrices_are_named(shipped):
         exported(images[:5], {"lidar2img": matrices})
     with pytest.raises(ValueError, match=r"of CAM_FRONT_RIGHT has shape \(4, 8, 3\): scale it"):
         exported([images[0], np.zeros((4, 8, 3)), *images[2:]], {"lidar2img": matrices})
+    wide = np.full((rows, columns, 3), 40_000, np.uint16)
+    for wrong, values in ((wide, "40000 to 40000"), (images[0] - 1.5, "-1.5 to -1.5")):
+        with pytest.raises(ValueError, match=f"0 to 255, the image of CAM_FRONT has {values}: con"):
+            exported([wrong, *images[1:]], {"lidar2img": matrices})
     with pytest.raises(ValueError, match=r"img_from_frame .* each of its 6 cameras .*\(5, 4, 4\)"):
         exported(images, {"lidar2img": matrices[:5], "can_bus": np.zeros(18)})
     with pytest.raises(ValueError, match="has no 'lidar2img'"):

@@ -187,11 +187,12 @@ class OnnxInferencer:
             The elements, best first, with scores and, if the model predicts them, Gaussians.
 
         Raises:
-            ValueError: If images or matrices do not fit the cameras, a matrix is missing, or a
-                value is not finite. For a model with memory, also if there is no stream, if the
-                stream belongs to another model, or if the frame is not later than the last frame of
-                the stream. For a model without memory, also if there is a stream. Also if the graph
-                fails on the inputs, or its outputs are not valid map elements.
+            ValueError: If images or matrices do not fit the cameras, a matrix is missing, a pixel
+                is not in [0, 255], or a value is not finite. For a model with memory, also if there
+                is no stream, if the stream belongs to another model, or if the frame is not later
+                than the last frame of the stream. For a model without memory, also if there is a
+                stream. Also if the graph fails on the inputs, or its outputs are not valid map
+                elements.
         """
         outputs = self.run(self.prepare(images, meta=meta, stream=stream))
         elements = self.elements(outputs)
@@ -324,7 +325,7 @@ class OnnxInferencer:
         stream.keep([StreamState(Frame.from_meta(meta), values=memory)])
 
     def _check_images(self, images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
-        """Raise ValueError if the number or the shapes of images do not fit the cameras."""
+        """Raise ValueError if number, shapes or values of images do not fit the cameras."""
         if len(images) != len(self.cameras):
             raise InputError(
                 f"{self.path.name} takes {len(self.cameras)} cameras, {', '.join(self.cameras)}, "
@@ -337,6 +338,11 @@ class OnnxInferencer:
                     f"{self.path.name} takes images of {rows} x {columns} (rows x columns, three "
                     f"channels), the image of {camera} has shape {np.shape(image)}: scale it and "
                     f"lidar2img alike, or export with --size."
+                )
+            if np.min(image) < 0 or np.max(image) > 255:
+                raise InputError(
+                    f"{self.path.name} takes images with values from 0 to 255, the image of "
+                    f"{camera} has {np.min(image)} to {np.max(image)}: convert it to 8 bits."
                 )
 
     def run(self, inputs: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[Any]]:
