@@ -1,6 +1,7 @@
 """Reader of nuScenes tables, which makes samples from the records of cameras and LiDAR."""
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache, partial
 from itertools import islice
@@ -175,8 +176,12 @@ class NuScenesTables:
         poses = read_table(self._folder, "ego_pose")
         self._store("ego_pose", (pose for pose in poses if pose["token"] in pose_tokens))
         self._store("sample_data", sample_data)
+        # Number of samples by token of the scene.
+        self._num_samples: Counter[str] = Counter()
         for sample in self._records["sample"].values():
             sample["data"] = {}
+            # Tables that other programs write may lack the token, which nothing else reads.
+            self._num_samples[sample.get("scene_token", "")] += 1
         for record in sample_data:
             if record["is_key_frame"]:
                 sample = self._records["sample"][record["sample_token"]]
@@ -300,10 +305,11 @@ class NuScenesTables:
         for sample in self.chain("sample", scene["first_sample_token"], step="next", origin=scene):
             number += 1
             yield sample
-        if number != scene["nbr_samples"]:
+        expected = self._num_samples[scene["token"]] or number
+        if number != expected:
             problem = (
-                f", record {scene['token']!r}: nbr_samples is {scene['nbr_samples']}, but its "
-                f"links lead to {format_count(number, 'sample')}"
+                f", record {scene['token']!r}: links lead to {number} of its "
+                f"{format_count(expected, 'sample')}"
             )
             raise _table_error(self._folder, "scene", problem=problem)
 
