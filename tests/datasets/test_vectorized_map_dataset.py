@@ -350,6 +350,30 @@ def test_data_sets_of_other_cars_are_joined_and_other_classes_are_named(
     with pytest.raises(ValueError, match=r"'split': 'train' and 'val'.*ignore_keys=\['split'\]"):
         DATASETS.build({**joined, "ignore_keys": "classes"})
     assert len(DATASETS.build({**joined, "ignore_keys": ["classes", "split"]})) == 2 * len(source)
+    samples = [replace(sample, cameras=sample.cameras[::-1]) for sample in samples]
+    write_annotations(tmp_path / "other.arrow", source.meta, samples)
+    with pytest.raises(ValueError, match=r"differ in 'rig': \['CAM_"):
+        DATASETS.build(joined)
+    selected = [{**part, "cameras": ["CAM_FRONT"]} for part in (first, other)]
+    assert len(DATASETS.build({**joined, "datasets": selected})) == 2 * len(source)
+
+
+def test_wrappers_and_data_sets_with_nested_metainfo_are_joined(build, minicity_annotations):
+    from mmdet3d.registry import DATASETS
+    from mmengine.dataset import BaseDataset
+
+    path = minicity_annotations["train"]
+    plain = {"type": "VectorizedMapDataset", "ann_file": str(path)}
+    repeated = {"type": "RepeatDataset", "times": 3, "dataset": plain}
+    inner = {"type": "ConcatDataset", "datasets": [repeated, plain]}
+    joined = DATASETS.build({"type": "ConcatDataset", "datasets": [inner, plain]})
+    assert len(joined) == 5 * len(AnnotationFile(path))
+    metainfo = {"palette": [[1], [1, 2]], "mean": np.ones(2)}
+    parts = [BaseDataset(metainfo=metainfo, lazy_init=True) for _ in range(2)]
+    assert joined.__class__(parts, lazy_init=True).metainfo["palette"] == [[1], [1, 2]]
+    parts[1]._metainfo["mean"] = np.zeros(2)
+    with pytest.raises(ValueError, match="differ in 'mean'"):
+        joined.__class__(parts, lazy_init=True)
 
 
 def test_it_tests_without_ground_truth_and_refuses_to_train(

@@ -353,7 +353,7 @@ class RigFitHook(Hook):
         # In a test, no training loop is built: the attribute is still a config, or None.
         if runner._resume or isinstance(runner._train_loop, dict | None):
             return
-        # The first of several data sets; mmengine requires that their metainfo are equal.
+        # The first of several data sets, whose cameras, classes, range and frame are equal.
         dataset = innermost(runner.train_dataloader.dataset)[0]
         state = checkpoint.get("state_dict", checkpoint)
         # A model for several GPUs is wrapped. Its wrapper adds the prefix "module." to all keys.
