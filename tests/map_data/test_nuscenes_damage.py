@@ -50,6 +50,16 @@ def test_a_broken_record_is_named(
         convert_nuscenes(replace(options, root=damaged_root))
 
 
+def test_a_link_to_another_scene_is_named(options: NuScenesOptions, damaged_root: Path):
+    records = change(damaged_root, "sample", 0)
+    number = next(i for i, record in enumerate(records) if not record["next"])
+    other = next(r for r in records if r["scene_token"] != records[number]["scene_token"])
+    change(damaged_root, "sample", number, next=other["token"])
+    message = f"links lead to sample '{other['token']}' of another scene"
+    with pytest.raises(ValueError, match=message):
+        convert_nuscenes(replace(options, root=damaged_root))
+
+
 def test_a_record_that_stands_twice_is_named(options: NuScenesOptions, damaged_root: Path):
     first = change(damaged_root, "scene", 0)[0]
     change(damaged_root, "scene", 1, token=first["token"])

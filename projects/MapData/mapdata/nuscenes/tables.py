@@ -299,10 +299,17 @@ class NuScenesTables:
         """Yield the sample records of a scene in order of time.
 
         Raises:
-            ValueError: If a link is broken, or the links do not lead to all samples of the scene.
+            ValueError: If a link is broken, or the links lead to another scene or do not lead to
+                all samples of the scene.
         """
         number = 0
         for sample in self.chain("sample", scene["first_sample_token"], step="next", origin=scene):
+            if sample.get("scene_token", scene["token"]) != scene["token"]:
+                problem = (
+                    f", record {scene['token']!r}: links lead to sample {sample['token']!r} of "
+                    "another scene"
+                )
+                raise _table_error(self._folder, "scene", problem=problem)
             number += 1
             yield sample
         expected = self._num_samples[scene["token"]] or number
