@@ -87,8 +87,8 @@ class Job:
         """Start the process of the current stage."""
         environment = {**os.environ, "PYTHON": sys.executable}  # read by `tools/dist_run.sh`
         if self.device is None:
-            # One thread for each process, also if the shell asks for more: there is a process for
-            # each core, and threads that wait for a core spin.
+            # One thread for each process, also if the shell asks for more: there may be a process
+            # for each core, and threads that wait for a core spin.
             environment["OMP_NUM_THREADS"] = "1"
         else:
             environment["CUDA_VISIBLE_DEVICES"] = self.device
