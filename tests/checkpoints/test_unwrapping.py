@@ -55,6 +55,8 @@ def test_averages_beside_their_weights_are_left_out_and_counted():
     assert "ema_other_weight" in unwrap(alone).state  # an average of no weight of the model
     beside = {"state_dict": STATE, "ema_state_dict": with_prefix("module."), "meta": {"a": 1}}
     assert unwrap(beside).left_out == {"weights under 'ema_state_dict'": len(STATE)}
+    nested = {"model": {"net": STATE}, "ema": {"module": with_prefix("module."), "updates": 1}}
+    assert unwrap(nested).left_out == {"weights under 'module' of 'ema'": len(STATE)}
 
 
 @pytest.mark.parametrize(

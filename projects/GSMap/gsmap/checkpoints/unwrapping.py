@@ -119,12 +119,19 @@ def _select_tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:
     return tensors
 
 
-def _count_other_states(content: Any, entries: Mapping[str, Any]) -> dict[str, int]:
-    """Count the weights in further state dicts beside ``entries``, such as averages."""
+def _count_other_states(
+    content: Mapping[Any, Any], entries: Mapping[str, Any], depth: int = 0
+) -> dict[str, int]:
+    """Count the weights in further state dicts than ``entries``, such as averages."""
     counts: dict[str, int] = {}
     for name, value in content.items():
-        if value is not entries and _is_state(value) and _has_dotted_key(value):
+        if value is entries or not isinstance(value, Mapping):
+            continue
+        if _is_state(value) and _has_dotted_key(value):
             counts[f"weights under {name!r:.80}"] = len(value)
+        elif depth < _DEEPEST:
+            for text, count in _count_other_states(value, entries, depth=depth + 1).items():
+                counts[f"{text} of {name!r:.80}"] = count
     return counts
 
 
