@@ -12,6 +12,7 @@ from processes import run_tool
 from upstream_configs import BASE, converted
 
 from gsmap.engine.launch import check_config, read_config
+from mapdata.upstream_configs.fields import Fields
 from mapdata.upstream_configs.reader import read_assignments
 from mapdata.upstream_configs.upstream import python_text
 
@@ -173,6 +174,17 @@ def test_what_has_one_value_here_is_named_with_any_other(theirs, other, named, t
     _, unplaced = converted(text.replace(theirs, other.format(theirs)), tmp_path)
     for name in named:
         assert any(f"{name} = " in line for line in unplaced)
+
+
+def test_lists_are_as_good_as_tuples_and_absent_settings_as_none(tmp_path):
+    order = "('self_attn', 'norm', 'cross_attn', 'norm', 'ffn', 'norm')"
+    text = upstream_configs.maptr().replace(order, f"[{order[1:-1]}]")
+    assert "operation_order=['self_attn'" in text
+    _, unplaced = converted(text, tmp_path)
+    assert unplaced == [BASE]
+    fields = Fields({"attention": {"type": "MultiheadAttention"}})
+    fields.drop("attention", names="type", dropout=None)
+    assert fields.left_over() == []
 
 
 def test_channels_vehicle_signals_and_distortion_arrive(tmp_path):

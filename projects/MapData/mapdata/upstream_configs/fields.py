@@ -107,7 +107,7 @@ class Fields:
         for name in names.split():
             values.pop(name, None)
         for name, value in fixed.items():  # any other value remains, and is reported as left over
-            if values.get(name) == value:
+            if name in values and _as_list(values[name]) == _as_list(value):
                 values.pop(name)
 
     def left_over(self) -> list[str]:
@@ -117,6 +117,11 @@ class Fields:
             if value is not None:
                 lines.append(f"{name} = {value!r}")
         return lines
+
+
+def _as_list(value: Any) -> Any:
+    """Convert a tuple to a list, since configs have either."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
