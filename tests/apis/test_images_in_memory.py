@@ -1,5 +1,7 @@
 """Images in memory, one sample and live, on a small MapTR with random weights."""
 
+import copy
+import pickle
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -94,6 +96,15 @@ def test_threads_that_share_a_live_rig_get_maps_of_their_images(inferencer, tmp_
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(lambda frame: live(frame[0]).points, frames))
     np.testing.assert_array_equal(found, alone)
+
+
+def test_a_copy_of_a_live_rig_predicts_as_well(inferencer, tmp_path):
+    images, *rig = in_memory(*make_samples(tmp_path, 1), tmp_path)
+    live = inferencer.live(*rig)
+    early = copy.deepcopy(live)
+    alone = live(images).points
+    for copied in (early, copy.copy(live), pickle.loads(pickle.dumps(live))):
+        np.testing.assert_array_equal(copied(images).points, alone)
 
 
 def test_threads_that_open_samples_at_once_write_files_of_their_own(

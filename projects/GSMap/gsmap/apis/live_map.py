@@ -123,6 +123,17 @@ class LiveMap:
         self._dataset: VectorizedMapDataset
         self._calibration_from_model: np.ndarray
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Attributes of a copy, which prepares the calibration at its first frame."""
+        attributes = {**self.__dict__, "_sizes": {}}
+        del attributes["_lock"]  # locks cannot be copied
+        attributes.pop("_dataset", None)  # its file is removed (`_prepare`)
+        return attributes
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock = threading.Lock()
+
     def __call__(
         self,
         images: Cameras,
