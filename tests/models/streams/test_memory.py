@@ -185,7 +185,14 @@ def test_a_sample_without_a_pose_is_named():
 def test_a_time_that_is_no_integer_is_refused(time):
     with pytest.raises(TypeError, match="timestamp_ns of sample 'a' must be an integer of nanosec"):
         Frame("a", "scene", time, np.eye(4))
-    assert Frame("a", "scene", np.int64(7), np.eye(4)).timestamp_ns == 7
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.uint64, np.array, torch.tensor])
+def test_a_time_of_any_integer_type_is_compared(kind):
+    scenes = Scenes(max_gap_s=2.0)
+    scenes.keep([StreamState(Frame("a", "scene", kind(7), np.eye(4)))])
+    with pytest.raises(ValueError, match="comes too late"):
+        scenes.previous([Frame("b", "scene", kind(6), np.eye(4))])
 
 
 def test_slots_start_anew_where_a_sample_does_not_follow():

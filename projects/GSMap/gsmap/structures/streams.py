@@ -9,6 +9,7 @@ A frame is one sample of a drive. The word is also used for coordinate systems, 
 frame", the coordinate system of the map elements of a sample.
 """
 
+import operator
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -42,11 +43,15 @@ class Frame:
     pose: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.timestamp_ns, int | np.integer):
+        try:
+            # Any integer becomes an `int`, because differences of unsigned ones are never negative.
+            timestamp_ns = operator.index(self.timestamp_ns)
+        except TypeError as error:
             raise InputTypeError(
                 f"timestamp_ns of sample {self.token!r} must be an integer of nanoseconds, got "
                 f"{self.timestamp_ns!r}."
-            )
+            ) from error
+        object.__setattr__(self, "timestamp_ns", timestamp_ns)  # the class is frozen
         pose = np.asarray(self.pose)
         if pose.shape != (4, 4) or not is_rigid(pose):
             raise InputError(
@@ -64,6 +69,7 @@ class Frame:
                 ``lidar2global``. Only the token may be missing.
 
         Raises:
+            TypeError: If the time is no integer.
             ValueError: If a field is missing or the pose is no rigid motion.
         """
         fields = ("scene", "timestamp_ns", "lidar2global")
