@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -261,6 +262,12 @@ def test_wrong_images_and_matrices_are_named(shipped):
     for wrong, values in ((wide, "40000 to 40000"), (images[0] - 1.5, "-1.5 to -1.5")):
         with pytest.raises(ValueError, match=f"0 to 255, the image of CAM_FRONT has {values}: con"):
             exported([wrong, *images[1:]], {"lidar2img": matrices})
+    calibration = {"lidar2img": matrices, "can_bus": np.zeros(18)}
+    white = np.full((900, 1600, 3), 255, np.float32)
+    largest = cv2.resize(white, (704, 256), interpolation=cv2.INTER_AREA).max()
+    assert largest > 255  # by rounding
+    white = np.full((rows, columns, 3), largest)
+    exported.prepare([white, torch.zeros(white.shape), *images[2:]], calibration)
     with pytest.raises(ValueError, match=r"img_from_frame .* each of its 6 cameras .*\(5, 4, 4\)"):
         exported(images, {"lidar2img": matrices[:5], "can_bus": np.zeros(18)})
     with pytest.raises(ValueError, match="has no 'lidar2img'"):

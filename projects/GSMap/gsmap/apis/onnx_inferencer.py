@@ -38,6 +38,8 @@ MEMORY_PREFIX = "memory_"
 # Types of numpy for the memory, by the names of ONNX Runtime.
 _PRECISIONS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _REQUIRED_OUTPUTS = {"scores", "labels", "points"}
+# White pixels in float32 become up to 255.0001 when OpenCV scales them.
+_ROUNDING = 0.01
 
 
 class OnnxInferencer:
@@ -339,10 +341,15 @@ class OnnxInferencer:
                     f"channels), the image of {camera} has shape {np.shape(image)}: scale it and "
                     f"lidar2img alike, or export with --size."
                 )
-            if np.min(image) < 0 or np.max(image) > 255:
+            values = np.asarray(image)
+            if values.dtype == np.uint8:  # all values are valid
+                continue
+            low = values.min()
+            high = values.max()
+            if low < -_ROUNDING or high > 255 + _ROUNDING:
                 raise InputError(
                     f"{self.path.name} takes images with values from 0 to 255, the image of "
-                    f"{camera} has {np.min(image)} to {np.max(image)}: convert it to 8 bits."
+                    f"{camera} has {low} to {high}: convert it to 8 bits."
                 )
 
     def run(self, inputs: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[Any]]:
