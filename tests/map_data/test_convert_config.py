@@ -187,6 +187,12 @@ def test_lists_are_as_good_as_tuples_and_absent_settings_as_none(tmp_path):
     assert fields.left_over() == []
 
 
+def test_every_fourth_sample_of_argoverse2_is_validated_as_in_the_releases(tmp_path):
+    text = upstream_configs.maptr_av2().replace("(ann_file", "(load_interval=4, ann_file")
+    _, unplaced = converted(text, tmp_path)
+    assert unplaced == [BASE, "data.train.load_interval = 4"]
+
+
 def test_channels_vehicle_signals_and_distortion_arrive(tmp_path):
     text = (
         upstream_configs.maptr()
