@@ -346,7 +346,8 @@ class OnnxInferencer:
                 continue
             low = values.min()
             high = values.max()
-            if low < -_ROUNDING or high > 255 + _ROUNDING:
+            is_finite = np.isfinite(low) and np.isfinite(high)  # if not, `prepare` raises an error
+            if is_finite and (low < -_ROUNDING or high > 255 + _ROUNDING):
                 raise InputError(
                     f"{self.path.name} takes images with values from 0 to 255, the image of "
                     f"{camera} has {low} to {high}: convert it to 8 bits."
