@@ -143,7 +143,7 @@ def test_elements_that_cannot_be_used_are_counted(known, damaged_root, tmp_path)
     for more, reason in (
         ({}, "lane_divider without two nodes left out"),
         ({"annotation": lines}, "line of fewer than two points left out"),
-        ({"annotation": lines}, "centerline left out, which --classes does not list"),
+        ({"annotation": lines}, "class 'centerline' left out, which --classes does not list"),
     ):
         infos = tmp_path / "infos_train.pkl"
         infos.write_bytes(pickle.dumps({"infos": [{**nuscenes_info(sample), **more}]}, protocol=4))

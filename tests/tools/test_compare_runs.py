@@ -54,7 +54,9 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
     command = [sys.executable, *words]
     with subprocess.Popen(command, cwd=REPO, env={**os.environ, **threads}) as comparison:
         wait_for(folder / "epoch_1.pth", comparison)
-        for process in ranks(folder):
+        processes = ranks(folder)
+        assert processes
+        for process in processes:
             environment = Path(f"/proc/{process}/environ").read_bytes().split(b"\0")
             assert b"OMP_NUM_THREADS=1" in environment
         comparison.send_signal(signal.SIGKILL)

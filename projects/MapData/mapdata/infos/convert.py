@@ -348,9 +348,9 @@ def _count_left_out(
     left_out = {"line of fewer than two points left out": num_short}
     for name, number in numbers.items():
         if name not in meta.classes:
-            left_out[f"{name} left out, which --classes does not list"] = number
+            left_out[f"class {name!r:.80} left out, which --classes does not list"] = number
     for reason, number in left_out.items():
-        if number:
+        if number > 0:
             summary.add_problem(reason, sample.token, count=number)
 
 

@@ -180,7 +180,8 @@ class NuScenesTables:
         self._num_samples: Counter[str] = Counter()
         for sample in self._records["sample"].values():
             sample["data"] = {}
-            # Tables that other programs write may lack the token, which nothing else reads.
+            # Tables that other programs write may lack the token. Their scenes have 0 samples here,
+            # and `samples_of` cannot check them.
             self._num_samples[sample.get("scene_token", "")] += 1
         for record in sample_data:
             if record["is_key_frame"]:
