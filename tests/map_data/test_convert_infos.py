@@ -131,7 +131,7 @@ def test_infos_with_maps_bring_their_truth(known, tmp_path):
 
 
 def test_elements_that_cannot_be_used_are_counted(known, damaged_root, tmp_path):
-    """A line of one node in the map; lines of one point and of other classes in a file."""
+    """A line of one node in the map; lines of a point, with heights, of other classes in a file."""
     sample = known[0]
     file = damaged_root / f"maps/expansion/{sample.map_name}.json"
     content = json.loads(file.read_text())
@@ -140,9 +140,11 @@ def test_elements_that_cannot_be_used_are_counted(known, damaged_root, tmp_path)
     del line["node_tokens"][1:]
     file.write_text(json.dumps(content))
     lines = annotation(sample, known.meta.classes)
+    lines["divider"].append(np.ones((2, 3)))  # a line with heights
     for more, reason in (
         ({}, "lane_divider without two nodes left out"),
         ({"annotation": lines}, "line of fewer than two points left out"),
+        ({"annotation": lines}, "line of 3 coordinates cut to 2"),
         ({"annotation": lines}, "class 'centerline' left out, which --classes does not list"),
     ):
         infos = tmp_path / "infos_train.pkl"

@@ -10,6 +10,7 @@ Argoverse 2. A transform ``b_from_a`` converts coordinates in frame a to frame b
 """
 
 import argparse
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -322,12 +323,12 @@ def _samples(
             else:
                 sample = _nuscenes_sample(info, meta, root=root, image_sizes=image_sizes)
             check_samples([sample], meta)
-            lines_by_class = info.get("annotation") or {}
-            numbers = {name: len(lines) for name, lines in lines_by_class.items()}
+            numbers = _numbers_left_out(info, meta)
         # Ground truth from a map is clipped to the range, so only ground truth of the file is
         # checked.
         if sample.instances is not None:
-            _count_left_out(sample, meta, numbers=numbers, summary=summary)
+            for reason, number in numbers.items():
+                summary.add_problem(reason, sample.token, count=number)
             _check_range(sample, meta)
         elif meta.frame == "lidar":
             local_map = open_map(sample.map_name)
@@ -340,18 +341,19 @@ def _samples(
         yield sample
 
 
-def _count_left_out(
-    sample: MapSample, meta: AnnotationMeta, numbers: dict[str, int], summary: ConversionSummary
-) -> None:
-    """Count the lines of an entry, given in ``numbers`` by class, that its sample lacks."""
-    num_short = sum(numbers[name] for name in meta.classes) - len(sample.instances or [])
-    left_out = {"line of fewer than two points left out": num_short}
-    for name, number in numbers.items():
+def _numbers_left_out(info: Mapping[str, Any], meta: AnnotationMeta) -> Counter[str]:
+    """Count the lines and heights of an entry that its sample lacks, by reason."""
+    numbers: Counter[str] = Counter()
+    for name, lines in (info.get("annotation") or {}).items():
         if name not in meta.classes:
-            left_out[f"class {name!r:.80} left out, which --classes does not list"] = number
-    for reason, number in left_out.items():
-        if number > 0:
-            summary.add_problem(reason, sample.token, count=number)
+            numbers[f"class {name!r:.80} left out, which --classes does not list"] = len(lines)
+            continue
+        for points in lines:
+            if len(points) < 2:
+                numbers["line of fewer than two points left out"] += 1
+            elif np.shape(points)[-1] > meta.dim:
+                numbers[f"line of {np.shape(points)[-1]} coordinates cut to {meta.dim}"] += 1
+    return +numbers  # without reasons that hold for no line
 
 
 def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
