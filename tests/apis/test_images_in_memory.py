@@ -136,6 +136,22 @@ def test_a_live_rig_takes_the_signals_of_the_vehicle(inferencer, tmp_path):
         live(images, np.full(18, np.nan))
 
 
+def test_missing_signals_are_named_once_if_the_model_was_trained_with_signals(
+    inferencer, tmp_path, caplog
+):
+    (sample,) = make_samples(tmp_path, 1)
+    images, *rig = in_memory(sample, tmp_path)
+    inferencer.live(*rig).predict(images)  # of no known training
+    assert "vehicle signals" not in caplog.text
+    inferencer.cfg.test_dataloader.dataset.signals_from_poses = True
+    live = inferencer.live(*rig)
+    live.predict(images, np.zeros(18))
+    assert "vehicle signals" not in caplog.text
+    for _ in range(2):
+        live.predict(images)
+    assert caplog.text.count("trained with vehicle signals") == 1
+
+
 def test_a_live_rig_continues_a_stream_as_the_drive_does(inferencer, tmp_path):
     """The calibration is that of the vehicle, and so is the pose; the model's is the LiDAR."""
     samples, remembering = drive(tmp_path, 2), make_remembering()

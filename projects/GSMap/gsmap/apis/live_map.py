@@ -23,6 +23,11 @@ _LOGGER = logging.getLogger(__name__)
 # Frame of a temporal model without a stream. The model requires a scene, a time and a pose, but
 # does not use them for an independent sample.
 _SINGLE_FRAME = Frame(token="in memory", scene="", timestamp_ns=0, pose=np.eye(4))
+_NO_SIGNALS_TEXT = (
+    "the model was trained with vehicle signals, and a frame without them is taken for that of a "
+    "standing vehicle, which makes the map worse: give can_bus, which motion_signals of "
+    "gsmap.structures.vehicle_signals (pose_only_signals for configs that have it) makes of poses."
+)
 
 if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
@@ -223,6 +228,8 @@ class LiveMap:
         # The data set reads these values in place of the image files and the annotation file.
         self._dataset.images_in_memory = pixels
         signals = None if can_bus is None else np.asarray(can_bus, dtype=float)
+        if signals is None and self._expects_signals():
+            self._warn_once(_NO_SIGNALS_TEXT)
         self._dataset.can_bus_in_memory = signals
         if at is not None:
             # Pose of the annotation frame of the model instead of the frame of the calibration.
@@ -241,6 +248,20 @@ class LiveMap:
         )
         (data_sample,) = predictions  # the data set has one sample
         return data_sample
+
+    def _expects_signals(self) -> bool:
+        """Whether the model reads vehicle signals and was trained with some."""
+        if "can_bus" not in self._inferencer.model.bev_encoder.calibration:
+            return False
+        # `adopt_settings` sets the first key if the checkpoint records signals.
+        keys = ("signals_from_poses", "pose_only_signals")
+        return any(self._config.get(key) for key in keys)
+
+    def _warn_once(self, text: str) -> None:
+        """Log a warning, unless it was logged before."""
+        if text not in self._logged_warnings:
+            _LOGGER.warning(text)
+            self._logged_warnings.add(text)
 
     def _prepare(self, pixels: dict[str, np.ndarray]) -> None:
         """Check the calibration, and create a data set of one sample with it.
@@ -264,11 +285,9 @@ class LiveMap:
             frame=self._frame,
             mount=mount,
         )
-        # Texts about implausible values. Each text is logged once, even if the image sizes change.
+        # Texts about implausible values. The image sizes may change, so each is logged once.
         for text in calibration_warnings(source.samples, source.frame, source.ground_z_m):
-            if text not in self._logged_warnings:
-                _LOGGER.warning("calibration: %s", text)
-                self._logged_warnings.add(text)
+            self._warn_once(f"calibration: {text}")
         model_cameras = self._config.get("cameras") or pixels  # a config without names allows all
         unknown = set(pixels) - set(model_cameras)
         # If the model has none of the given names, the cameras are assigned to the cameras of the
