@@ -215,6 +215,20 @@ def test_an_absent_camera_in_memory_is_an_error_or_blank(inferencer, tmp_path):
     assert found.metainfo["cam_names"] == ["CAM_BACK"]
 
 
+def test_a_live_rig_may_lose_a_camera_and_get_it_back(inferencer, tmp_path):
+    images, *rig = in_memory(*make_samples(tmp_path, 1), tmp_path)
+    live = inferencer.live(*rig, allow_missing_cameras=True)
+    whole = live(images).points
+    left = {"CAM_BACK": images["CAM_BACK"]}
+    alone = inferencer.predict_images(
+        left, *({"CAM_BACK": part["CAM_BACK"]} for part in rig), allow_missing_cameras=True
+    )
+    np.testing.assert_array_equal(live(left).points, inferencer.elements(alone).points)
+    np.testing.assert_array_equal(live(images).points, whole)
+    with pytest.raises(ValueError, match=r"must have the cameras of the images, \['CAM_BACK'\]"):
+        inferencer.live(*rig)(left)
+
+
 @pytest.mark.parametrize(
     ("which", "value", "error", "text"),
     [

@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -91,7 +91,8 @@ class LiveMap:
             of the config. The pose of an annotation frame on the vehicle is taken from the training
             data if the model was trained in this frame, and otherwise from nuScenes (``lidar``) or
             Argoverse 2 (``ego``).
-        allow_missing_cameras: Whether cameras of the model may be absent.
+        allow_missing_cameras: Whether cameras of the model may be absent. If the calibration is
+            given by name, a frame may then lack images of its cameras, too.
         prior: Map of earlier drives, for a model that reads a prior.
         update_prior: Whether to write the prediction of each frame to ``prior``.
 
@@ -277,11 +278,16 @@ class LiveMap:
         # calibration is in this annotation frame. None selects the usual pose of the frame.
         training_mount = self._inferencer.model.mount
         mount = training_mount if self._frame == training_mount.frame else None
+        intrinsics = self._intrinsics
+        cam_from_frame = self._cam_from_frame
+        if self._allow_missing_cameras:
+            intrinsics = _of_cameras(intrinsics, names=pixels)
+            cam_from_frame = _of_cameras(cam_from_frame, names=pixels)
         # One sample with names and sizes of the images, and the calibration.
         source = source_in_memory(
             pixels,
-            intrinsics=self._intrinsics,
-            cam_from_frame=self._cam_from_frame,
+            intrinsics=intrinsics,
+            cam_from_frame=cam_from_frame,
             frame=self._frame,
             mount=mount,
         )
@@ -316,3 +322,10 @@ class LiveMap:
         )
         self._dataset = dataset
         self._calibration_from_model = invert_rigid(ground_from_calibration) @ ground_from_model
+
+
+def _of_cameras(values: Cameras, names: Collection[str]) -> Cameras:
+    """Arrays of the cameras with these names; all arrays if they are in a list."""
+    if not isinstance(values, Mapping):
+        return values
+    return {name: value for name, value in values.items() if str(name) in names}
