@@ -91,21 +91,18 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     steps = []
     if log:
         steps = [entry["step"] for entry in log.train]
-    if figures:
-        state = "done"
-    else:
-        default_state = "cut off" if steps else "not started"
-        state = record.get("state", default_state)
-        if steps:
-            state += f", after {max(steps):.0f} iterations"
-    costs = _training_costs(log, record) if log and steps else {}
+    state = "done" if figures else _unfinished_state(record, steps)
+    costs = {}
+    if log and steps:
+        costs = _training_costs(log, steps, record=record)
     newest = newest_checkpoint(folder) if figures else None
     if newest:
         costs["million parameters"] = _count_parameters(newest) / 1e6
     # The log of a test is named by its date. Its last line has the mean times per batch.
     tests = sorted(folder.glob("test/*/[0-9]*.json"))
     if tests:
-        timing = json.loads(tests[-1].read_text().splitlines()[-1])
+        lines = tests[-1].read_text().splitlines()
+        timing = json.loads(lines[-1])
         costs["seconds a test batch"] = timing["time"] - timing["data_time"]  # without loading
     if seed is None and log:
         seed = _config(folder).section("randomness").get("seed")
@@ -125,14 +122,25 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     )
 
 
-def _training_costs(log: RunLog, record: Mapping[str, Any]) -> dict[str, float]:
+def _unfinished_state(record: Mapping[str, Any], steps: Sequence[float]) -> str:
+    """State of a run without figures, given its logged iterations."""
+    default_state = "cut off" if steps else "not started"
+    state = record.get("state", default_state)
+    if steps:
+        state += f", after {max(steps):.0f} iterations"
+    return state
+
+
+def _training_costs(
+    log: RunLog, steps: Sequence[float], record: Mapping[str, Any]
+) -> dict[str, float]:
     """Costs of a training that has begun, by keys of ``_COSTS``.
 
     Args:
         log: The training log.
+        steps: The iterations in the log.
         record: Record of the run, with ``peak_mib`` if its memory was measured.
     """
-    steps = [entry["step"] for entry in log.train]
     _, seconds = log.series("time")
     costs = {"iterations": max(steps), "seconds a step": float(np.median(seconds))}
     _, memory = log.series("memory")  # only logged on a GPU
@@ -145,8 +153,11 @@ def _training_costs(log: RunLog, record: Mapping[str, Any]) -> dict[str, float]:
 
 def _count_parameters(checkpoint: Path) -> int:
     """Number of weights, without the statistics of batch normalization."""
-    weights = read_weights(checkpoint).items()
-    return sum(weight.numel() for key, weight in weights if not key.endswith(_BATCH_STATISTICS))
+    count = 0
+    for key, weight in read_weights(checkpoint).items():
+        if not key.endswith(_BATCH_STATISTICS):
+            count += weight.numel()
+    return count
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -224,9 +235,11 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
     configs = []
     allowed = {"ground_truth_points"}
     for config in (ChamferConfig, RasterConfig):
-        names = {field.name for field in fields(config)}
-        allowed |= names
-        config_settings = {key: settings[key] for key in names & settings.keys()}
+        config_settings = {}
+        for field in fields(config):
+            allowed.add(field.name)
+            if field.name in settings:
+                config_settings[field.name] = settings[field.name]
         configs.append(config(**config_settings))
     unknown = settings.keys() - allowed
     if unknown:
@@ -324,7 +337,11 @@ def pairs_with_first(results: Sequence[Result]) -> list[tuple[Result, Result]]:
             first_runs[result.seed] = result
         else:
             others.append(result)
-    return [(first_runs[run.seed], run) for run in others if run.seed in first_runs]
+    pairs = []
+    for other in others:
+        if other.seed in first_runs:
+            pairs.append((first_runs[other.seed], other))
+    return pairs
 
 
 def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[float]]]:
@@ -347,7 +364,8 @@ def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[
 def folders_without_pair(results: Sequence[Result]) -> list[str]:
     """Folders of the finished runs in no pair of `pairs_with_first`, if there are two configs."""
     done = _finished(results)
-    if len({result.name for result in done}) < 2:
+    config_names = {result.name for result in done}
+    if len(config_names) < 2:
         return []
     paired: set[Path] = set()
     for first, result in pairs_with_first(results):
@@ -376,16 +394,8 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         done = _finished(config_results)
         failed = len(config_results) - len(done)
         seeds = f"{len(done)} ({failed} not done)" if failed else f"{len(done)}"
-        row = [name, seeds]
-        for key in columns:
-            values = [result.figures[key] for result in done if result.figures[key] != UNDEFINED]
-            row.append(_cell(values, factor=100))
-        figure_rows.append(row)
-        row = [name]
-        for key, form in _COSTS.items():
-            known_costs = [run.costs[key] for run in done if key in run.costs]
-            row.append(_cell(known_costs, form=form))
-        cost_rows.append(row)
+        figure_rows.append([name, seeds, *_figure_cells(done, columns)])
+        cost_rows.append([name, *_cost_cells(done)])
     difference_rows = []
     num_seeds = Counter(result.name for _, result in pairs_with_first(results))  # of both configs
     for name, differences in differences_to_first(results).items():
@@ -414,6 +424,28 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         markdown_table(["config", "seed", "state", "folder", "machine", "load"], run_rows),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _figure_cells(done: Sequence[Result], columns: Sequence[str]) -> list[str]:
+    """Cells of the figures of one config, over its finished runs."""
+    cells = []
+    for key in columns:
+        values = []
+        for result in done:
+            value = result.figures[key]
+            if value != UNDEFINED:
+                values.append(value)
+        cells.append(_cell(values, factor=100))
+    return cells
+
+
+def _cost_cells(done: Sequence[Result]) -> list[str]:
+    """Cells of the costs of one config, over its finished runs."""
+    cells = []
+    for key, form in _COSTS.items():
+        known_costs = [result.costs[key] for result in done if key in result.costs]
+        cells.append(_cell(known_costs, form=form))
+    return cells
 
 
 def _run_row(result: Result) -> list[str]:
@@ -477,17 +509,28 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
             label: str | None = name
             for log in runs:
                 steps, values = log.series(f"{metric}/mAP", validation=True)
-                # Iterations of an epoch. It is exact if the last one of an epoch was logged. The
-                # ratio of an epoch that was cut off is smaller.
-                per_epoch = [row["step"] / row["epoch"] for row in log.train if "epoch" in row]
-                if per_epoch:
+                per_epoch = _iterations_per_epoch(log)
+                if per_epoch is not None:
                     # The steps of the validation are epochs. Convert them to iterations.
-                    steps = max(per_epoch) * steps
+                    steps = per_epoch * steps
                 panel.plot(steps, 100 * values, ".-", color=colour, label=label)
                 label = None  # one entry of the legend for all seeds
         panel.set_ylim(0)
         finish_panel(panel, f"mAP_{metric} (%)", "iteration")
     return figure
+
+
+def _iterations_per_epoch(log: RunLog) -> float | None:
+    """Iterations of an epoch; None if the training log counts no epochs.
+
+    The number is exact if the last iteration of an epoch was logged. The ratio of an epoch that was
+    cut off is smaller.
+    """
+    ratios = []
+    for entry in log.train:
+        if "epoch" in entry:
+            ratios.append(entry["step"] / entry["epoch"])
+    return max(ratios, default=None)
 
 
 def apply_rescoring(
