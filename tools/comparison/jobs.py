@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -141,8 +141,8 @@ class Job:
 
         For a rank that ended with a traceback, this is the last line of the traceback.
         """
-        text = self._log.read_bytes()[self._log_start :].decode(errors="replace")
-        lines = text.splitlines()
+        output = self._log.read_bytes()[self._log_start :]
+        lines = output.decode(errors="replace").splitlines()
         for before, line in zip(["", *lines], lines, strict=False):
             if line.startswith("error: "):
                 # After a traceback of a rank, the launcher says only which rank has failed.
@@ -179,7 +179,7 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
     Yields:
         Each run when it has ended, with its state: ``done``, or a sentence about the failure.
     """
-    waiting = deque(run for run in runs if not run.is_done)
+    waiting = deque([run for run in runs if not run.is_done])
     jobs: dict[str | None, Job] = {}  # the running job of each device
     usable_devices = devices()
     initial = sum(run.iterations_so_far for run in runs)
@@ -201,12 +201,7 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
                     if job.poll():
                         del jobs[job.device]
                         yield job.run, job.record["state"]
-                stages = []
-                for job in jobs.values():
-                    stages.append(f"{job.run.label} {job.stage}s")  # "NAME trains", "NAME tests"
-                num_done = sum(run.is_done for run in runs)
-                summary = f"{num_done} of {len(runs)} runs done"
-                bar.set_description(", ".join([summary, *stages]), refresh=False)
+                bar.set_description(_describe_progress(runs, jobs.values()), refresh=False)
                 iterations = sum(run.iterations_so_far for run in runs)
                 bar.update(iterations - bar.n)  # the argument is an increment
                 if jobs:
@@ -214,3 +209,15 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
         finally:
             for job in jobs.values():
                 job.end("cut off")
+
+
+def _describe_progress(runs: Sequence[Run], jobs: Iterable[Job]) -> str:
+    """Number of finished runs, then the stage of each running job."""
+    num_done = 0
+    for run in runs:
+        if run.is_done:
+            num_done += 1
+    texts = [f"{num_done} of {len(runs)} runs done"]
+    for job in jobs:
+        texts.append(f"{job.run.label} {job.stage}s")  # "NAME trains", "NAME tests"
+    return ", ".join(texts)
