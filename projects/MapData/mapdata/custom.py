@@ -122,7 +122,8 @@ def from_records(
             lines.append(str(record.get("token") if isinstance(record, Mapping) else record))
         if calibration is not None:
             lines.append(digest_of_calibration(Path(calibration)))
-        source = hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        text = "\n".join(lines)
+        source = hashlib.sha256(text.encode()).hexdigest()
     if calibration is not None:
         records = calibrated_records(
             list(records), Path(calibration), meta=meta, root=Path(data_root), shard=shard
@@ -284,18 +285,12 @@ def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
     for name, value in record.items():
         if value is not None:
             values[name] = value
-    values["cameras"] = [
-        _create_camera(camera, token=token, root=root) for camera in record["cameras"]
-    ]
+    cameras = []
+    for camera in record["cameras"]:
+        cameras.append(_create_camera(camera, token=token, root=root))
+    values["cameras"] = cameras
     if "lidar" in values:
-        lidar = values["lidar"]
-        _require_keys(lidar, known=_LIDAR_KEYS, where="lidar: ")
-        frame_from_lidar = lidar.get("frame_from_lidar")
-        values["lidar"] = LidarRecord(
-            path=lidar["path"],
-            frame_from_lidar=np.eye(4) if frame_from_lidar is None else frame_from_lidar,
-            sweeps=[_create_record(SweepRecord, sweep) for sweep in lidar.get("sweeps", [])],
-        )
+        values["lidar"] = _create_lidar(values["lidar"])
     if "instances" in values:
         elements = []
         for instance in values["instances"]:
@@ -331,7 +326,8 @@ def _transform_elements(record: Mapping[str, Any], meta: AnnotationMeta) -> dict
         offsets = points - pose[: points.shape[1], 3]
         local_points = offsets @ rotation  # points are rows, so this is the inverse rotation
         instances.append({**item, "points": local_points})
-    local_record = {name: value for name, value in record.items() if name != _GLOBAL}
+    local_record = dict(record)
+    del local_record[_GLOBAL]
     local_record["instances"] = instances
     return local_record
 
@@ -341,8 +337,23 @@ def _create_record(kind: type[Record], values: Mapping[str, Any]) -> Record:
 
     Keys of the mapping that are not fields of the dataclass are ignored.
     """
-    arguments = {field.name: values[field.name] for field in fields(kind)}  # type: ignore[arg-type]
+    arguments = {}
+    for field in fields(kind):  # type: ignore[arg-type]
+        arguments[field.name] = values[field.name]
     return kind(**arguments)
+
+
+def _create_lidar(lidar: Mapping[str, Any]) -> LidarRecord:
+    """Create the record of a LiDAR scan; its pose is by default the frame's."""
+    _require_keys(lidar, known=_LIDAR_KEYS, where="lidar: ")
+    frame_from_lidar = lidar.get("frame_from_lidar")
+    if frame_from_lidar is None:
+        frame_from_lidar = np.eye(4)
+    path = lidar["path"]
+    sweeps = []
+    for sweep in lidar.get("sweeps", []):
+        sweeps.append(_create_record(SweepRecord, sweep))
+    return LidarRecord(path=path, frame_from_lidar=frame_from_lidar, sweeps=sweeps)
 
 
 def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
