@@ -70,7 +70,8 @@ def camera_rows(dataset: "VectorizedMapDataset", trained: Sequence[str]) -> list
     """
     names = camera_names(dataset)
     if set(names) <= set(trained):
-        return [list(trained).index(name) for name in names]
+        trained_names = list(trained)
+        return [trained_names.index(name) for name in names]
     num_samples = min(len(dataset), _MAX_SAMPLES)
     samples = map(dataset.sample, range(num_samples))
     fullest_sample = max(samples, key=lambda sample: len(sample.cameras))
@@ -80,7 +81,10 @@ def camera_rows(dataset: "VectorizedMapDataset", trained: Sequence[str]) -> list
 
 def camera_names(dataset: "VectorizedMapDataset") -> Sequence[str]:
     """Return the names of a data set's cameras; by default the cameras of its first sample."""
-    return dataset.cameras or [camera.name for camera in dataset.sample(0).cameras]
+    if dataset.cameras:
+        return dataset.cameras
+    first_sample = dataset.sample(0)
+    return [camera.name for camera in first_sample.cameras]
 
 
 def similar_cameras(
@@ -303,7 +307,8 @@ def _fit_classes(
         state[key] = weights
     with_weights = summarize_names(list(old_rows))
     without_weights = summarize_names(new_classes)
-    dropped = summarize_names([name for name in trained if name not in names])
+    dropped_classes = [name for name in trained if name not in names]
+    dropped = summarize_names(dropped_classes)
     return [
         f"classes keep their weights: {with_weights}; begin as new: {without_weights}; are left "
         f"out: {dropped}."
@@ -357,7 +362,9 @@ class RigFitHook(Hook):
         dataset = innermost(runner.train_dataloader.dataset)[0]
         state = checkpoint.get("state_dict", checkpoint)
         # A model for several GPUs is wrapped. Its wrapper adds the prefix "module." to all keys.
-        weights = {key.removeprefix("module."): value for key, value in state.items()}
+        weights = {}
+        for key, value in state.items():
+            weights[key.removeprefix("module.")] = value
         if is_upstream(weights):  # keys of the code of the model's authors
             weights = ours_from_upstream(weights)
         model = getattr(runner.model, "module", runner.model)
@@ -381,10 +388,12 @@ def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     Returns:
         The known facts among ``cameras``, ``classes``, ``frame``, ``x_range`` and ``y_range``.
     """
-    metadata: Any = (checkpoint.get("meta") or {}).get("dataset_meta") or {}
+    meta: Any = checkpoint.get("meta") or {}
+    metadata: Any = meta.get("dataset_meta") or {}
     for model in named_models().values():
         if not metadata and Path(str(path)) == model.file:
-            metadata = dict(Config.fromfile(shipped_path(model.config)).train_dataloader.dataset)
+            config = Config.fromfile(shipped_path(model.config))
+            metadata = dict(config.train_dataloader.dataset)
             metadata |= metadata["grid"]  # x_range and y_range
     if not isinstance(metadata, Mapping):
         return {}
