@@ -114,11 +114,13 @@ def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[s
     metric = METRICS.build({"type": "MapMetric", "eval": ["chamfer"]})
     metric.dataset_meta = dataset.metainfo  # classes and range, which a runner would set
     count = min(samples or len(dataset), len(dataset))
-    indices = np.linspace(0, len(dataset) - 1, count).round().astype(int)
+    places = np.linspace(0, len(dataset) - 1, count)
+    indices = places.round().astype(int)
     for index in indices.tolist():
-        predictions = model.test_step(pseudo_collate([dataset[index]]))
+        batch = pseudo_collate([dataset[index]])
+        predictions = [sample.to_dict() for sample in model.test_step(batch)]
         # The metric reads only the predictions, with their ground truth, and not the input batch.
-        metric.process(None, [sample.to_dict() for sample in predictions])
+        metric.process(None, predictions)
     figures = metric.evaluate(count)  # all samples that were processed
     aps = {}
     for name in dataset.metainfo["classes"]:
@@ -144,7 +146,10 @@ def resilience(figures: dict[str, list[dict[str, float]]], kind: str) -> float:
     NaN if the AP without corruption is 0.
     """
     (clean,) = mean_aps(figures, CLEAN)  # a list of one value
-    return 100 * float(np.mean(mean_aps(figures, kind))) / clean if clean > 0 else float("nan")
+    if clean > 0:
+        mean_ap = float(np.mean(mean_aps(figures, kind)))
+        return 100 * mean_ap / clean
+    return float("nan")
 
 
 def table(figures: dict[str, list[dict[str, float]]]) -> str:
@@ -153,10 +158,12 @@ def table(figures: dict[str, list[dict[str, float]]]) -> str:
     heads = ["corruption", *(str(severity) for severity in SEVERITIES), "resilience"]
     rows = []
     for kind in figures:
-        if kind != CLEAN:
-            cells = [f"{ap:.1f}" for ap in mean_aps(figures, kind)]
-            share = resilience(figures, kind)
-            rows.append([kind, *cells, "-" if isnan(share) else f"{share:.0f} %"])
+        if kind == CLEAN:
+            continue
+        cells = [f"{ap:.1f}" for ap in mean_aps(figures, kind)]
+        share = resilience(figures, kind)
+        last_cell = "-" if isnan(share) else f"{share:.0f} %"
+        rows.append([kind, *cells, last_cell])
     return f"AP_chamfer without corruption: {clean:.1f}\n\n{markdown_table(heads, rows)}\n"
 
 
@@ -208,9 +215,15 @@ def other_figures(
         ValueError: If the figures without corruption or the seeds differ, so that earlier ones
             would be lost.
     """
-    others = {kind: rows for kind, rows in earlier.items() if kind not in {CLEAN, *args.kinds}}
+    measured_kinds = {CLEAN, *args.kinds}
+    others = {}
+    for kind, rows in earlier.items():
+        if kind not in measured_kinds:
+            others[kind] = rows
+    if not others:
+        return others
     # Files of earlier versions have no seed: it is taken to be the default.
-    before = {"seed": 0, **earlier[CLEAN][0]} if others else clean[0]
+    before = {"seed": 0, **earlier[CLEAN][0]}
     if before != clean[0]:
         raise InputError(
             f"{args.out} has figures of {', '.join(others)} of another model, other samples or "
@@ -284,13 +297,17 @@ def main() -> str:
                 others = other_figures(earlier, measured[CLEAN], args)
         measured.update(others)
         # In a fixed order, whether they were measured now or in an earlier run.
-        figures = {kind: measured[kind] for kind in (CLEAN, *KINDS) if kind in measured}
+        figures = {}
+        for kind in (CLEAN, *KINDS):
+            if kind in measured:
+                figures[kind] = measured[kind]
         text = table(figures)
         write_text(args.out / "robustness.json", json.dumps(figures, indent=1) + "\n")
         write_text(args.out / "robustness.md", text)
         means = {kind: mean_aps(figures, kind) for kind in figures}
         (clean,) = means.pop(CLEAN)
-        save_figure(plot_severities(means, clean, SEVERITIES), args.out / "robustness.png")
+        figure = plot_severities(means, clean, SEVERITIES)
+        save_figure(figure, args.out / "robustness.png")
     return f"{text}\nfiles: {args.out}"
 
 
