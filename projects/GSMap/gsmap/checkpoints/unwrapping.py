@@ -78,21 +78,13 @@ def unwrap(content: Any) -> Unwrapped:
     left_out: dict[str, int] = {}
     if len(weights) < len(entries):
         left_out["entries that are no tensors"] = len(entries) - len(weights)
-    # Single numbers such as the epoch are counters. But if no key has a dot, the weights belong to
-    # one module without submodules, and a single number may be a weight.
-    if _has_dotted_key(weights):
-        counters = [key for key, value in weights.items() if _is_counter(key, value=value)]
-        if counters:
-            left_out["counters"] = len(counters)
-        for key in counters:
-            del weights[key]
+    counters = _find_counters(weights)
+    if counters:
+        left_out["counters"] = len(counters)
+    for key in counters:
+        del weights[key]
     state = _unwrap_keys(weights)
-    averages: set[str] = set()
-    # The average of the weight `a.b` is `ema_a_b`. An average without its weight is kept.
-    for key in state:
-        name_of_average = _AVERAGED + key.replace(".", "_")
-        if name_of_average in state:
-            averages.add(name_of_average)
+    averages = _find_averages(state)
     if averages:
         left_out["averages of weights (EMA)"] = len(averages)
     for key in averages:
@@ -141,7 +133,8 @@ def _describe_contents(content: Any) -> str:
         finding = f"is a {type(content).__name__}"
     else:
         names = [key for key in content if isinstance(key, str)]
-        finding = f"has the keys {names[:_MAX_KEYS_SHOWN]!r:.300}" if names else "has no key"
+        shown_names = names[:_MAX_KEYS_SHOWN]
+        finding = f"has the keys {shown_names!r:.300}" if names else "has no key"
     return (
         f"holds no state dict of tensors: it {finding}, and weights must be its entries or "
         f"be under {', '.join(WRAPPERS)}: give a training checkpoint"
@@ -190,10 +183,33 @@ def _has_dotted_key(state: Mapping[str, Any]) -> bool:
     return any("." in key for key in state)
 
 
-def _is_counter(key: str, value: Tensor) -> bool:
-    """Whether an entry is a single number that belongs to no submodule."""
-    # Keys of averages have no dot either, but belong to weights.
-    return "." not in key and not key.startswith(_AVERAGED) and value.numel() == 1
+def _find_counters(weights: Mapping[str, Tensor]) -> list[str]:
+    """Keys of single numbers that belong to no submodule, such as the epoch.
+
+    Keys of averages have no dot either, but belong to weights. If no key at all has a dot, the
+    weights belong to one module without submodules, and a single number may be a weight.
+    """
+    if not _has_dotted_key(weights):
+        return []
+    counters = []
+    for key, value in weights.items():
+        is_average = key.startswith(_AVERAGED)
+        if "." not in key and not is_average and value.numel() == 1:
+            counters.append(key)
+    return counters
+
+
+def _find_averages(state: Mapping[str, Tensor]) -> set[str]:
+    """Keys of moving averages of weights: the average of the weight ``a.b`` is ``ema_a_b``.
+
+    An average without its weight counts as a weight.
+    """
+    averages: set[str] = set()
+    for key in state:
+        name_of_average = _AVERAGED + key.replace(".", "_")
+        if name_of_average in state:
+            averages.add(name_of_average)
+    return averages
 
 
 def _require_stored(weights: Iterable[Tensor]) -> None:
@@ -223,10 +239,10 @@ def _unwrap_keys(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Raises:
         UnfitError: If two keys become equal.
     """
-    names = list(map(_remove_wrapper_parts, weights))
+    names = _inner_names(weights, prefix="")
     prefix = _common_prefix(names)
     while prefix:  # modules around the model may be nested
-        names = [_remove_wrapper_parts(name.removeprefix(prefix)) for name in names]
+        names = _inner_names(names, prefix)
         prefix = _common_prefix(names)
     state: dict[str, Tensor] = {}
     for name, value in zip(names, weights.values(), strict=True):
@@ -236,11 +252,20 @@ def _unwrap_keys(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return state
 
 
+def _inner_names(names: Iterable[str], prefix: str) -> list[str]:
+    """Names without a prefix, and without the parts that wrappers add after it."""
+    inner_names = []
+    for name in names:
+        inner_names.append(_remove_wrapper_parts(name.removeprefix(prefix)))
+    return inner_names
+
+
 def _common_prefix(names: Sequence[str]) -> str:
     """First prefix of a module around the model that all names start with; empty if none."""
+    if not names:  # `all` would be True, and the caller would never stop
+        return ""
     for prefix in _OUTER_PREFIXES:
-        # Without `names`, `all` would be True, and the caller would never stop.
-        if names and all(name.startswith(prefix) for name in names):
+        if all(name.startswith(prefix) for name in names):
             return prefix
     return ""
 
