@@ -1,7 +1,6 @@
 """Samplers of drives: pieces in order, deterministic and resumable, ranks that share nothing."""
 
-from collections import Counter
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import pytest
 
@@ -16,8 +15,11 @@ class Drives(VectorizedMapDataset):
     """Scenes of given lengths, their samples numbered through."""
 
     def __init__(self, lengths=LENGTHS) -> None:
-        numbers = iter(range(sum(lengths)))
-        self.of_scene = [[next(numbers) for _ in range(length)] for length in lengths]
+        self.of_scene = []
+        start = 0
+        for length in lengths:
+            self.of_scene.append(list(range(start, start + length)))
+            start += length
 
     def scenes(self) -> list[list[int]]:
         return self.of_scene
@@ -44,22 +46,35 @@ def batches(count: int, **settings) -> list[list[int]]:
     return [next(endless) for _ in range(count)]
 
 
+def scene_of_samples() -> dict[int, int]:
+    """Number of the scene of each sample."""
+    scene_of = {}
+    for scene, samples in enumerate(Drives().of_scene):
+        for sample in samples:
+            scene_of[sample] = scene
+    return scene_of
+
+
 def continued(found: list[list[int]]) -> float:
     """Return the share of samples that follow the one before in their slot and scene."""
-    scene = {i: s for s, samples in enumerate(Drives().of_scene) for i in samples}
-    pairs = [p for a, b in pairwise(found) for p in zip(a, b, strict=True)]
-    return sum(b == a + 1 and scene[a] == scene[b] for a, b in pairs) / len(pairs)
+    scene_of = scene_of_samples()
+    following = []
+    for batch, next_batch in pairwise(found):
+        for sample, next_sample in zip(batch, next_batch, strict=True):
+            is_same_scene = scene_of[sample] == scene_of[next_sample]
+            following.append(next_sample == sample + 1 and is_same_scene)
+    return sum(following) / len(following)
 
 
 def test_samples_of_a_piece_follow_one_another(rank):
     found = batches(120)
     assert continued(found) > 0.6  # pieces have three samples or so
-    runs = Counter(a == b - 1 for a, b in zip(found[0], found[1], strict=True))
-    assert sum(runs.values()) == 2
+    assert len(found[0]) == len(found[1]) == 2
 
 
 def test_single_frames_come_first_and_the_late_switch_is_later(rank):
-    found, late = (batches(300, single_frame_iters=60, late_switch=late) for late in (False, True))
+    found = batches(300, single_frame_iters=60, late_switch=False)
+    late = batches(300, single_frame_iters=60, late_switch=True)
     assert continued(found[:60]) < 0.1
     assert continued(found[60:90]) > 0.5
     assert continued(late[60:90]) < continued(found[60:90])
@@ -73,17 +88,20 @@ def test_the_same_epoch_gives_the_same_samples_and_epochs_continue(rank):
     assert len(first) == len(sampler) == 64
     sampler.set_epoch(1)
     endless = sampler.batches()
-    both = [index for _ in range(64) for index in next(endless)]
+    both = []
+    for _ in range(64):
+        both += next(endless)
     assert first + list(sampler) == both
 
 
 def test_ranks_draw_differently_from_the_same_order_of_scenes(rank):
-    scene = {i: s for s, samples in enumerate(Drives().of_scene) for i in samples}
-    starts = []
+    scene_of = scene_of_samples()
+    starts = set()
     for number in range(2):
         rank(number, 2)
-        starts.append([scene[index] for index in batches(1)[0]])
-    assert len({*starts[0], *starts[1]}) == 4  # of one permutation
+        (first_batch,) = batches(1)
+        starts.update(scene_of[sample] for sample in first_batch)
+    assert len(starts) == 4  # of one permutation
 
 
 def test_testing_hands_out_each_sample_once_and_whole_scenes_to_a_rank(rank):
@@ -99,17 +117,21 @@ def test_testing_hands_out_each_sample_once_and_whole_scenes_to_a_rank(rank):
 
 
 def test_batches_of_streams_never_have_two_samples_of_a_scene(rank):
-    scene = {i: s for s, samples in enumerate(Drives().of_scene) for i in samples}
+    scene_of = scene_of_samples()
     sampler = StreamBatches(StreamTestSampler(Drives()), 4)
     found = list(sampler)
     assert len(found) == len(sampler)
-    assert sorted(index for batch in found for index in batch) == list(range(64))
-    assert all(len({scene[i] for i in batch}) == len(batch) for batch in found)
-    assert [len(batch) for batch in found][:10] == [4] * 10
-    seen: dict[int, int] = {}
-    for index in (index for batch in found for index in batch):
-        assert seen.get(scene[index], -1) < index
-        seen[scene[index]] = index
+    for batch in found:
+        assert len({scene_of[sample] for sample in batch}) == len(batch)
+    for batch in found[:10]:
+        assert len(batch) == 4
+    samples = list(chain.from_iterable(found))
+    assert sorted(samples) == list(range(64))
+    last_of_scene: dict[int, int] = {}
+    for sample in samples:
+        scene = scene_of[sample]
+        assert last_of_scene.get(scene, -1) < sample
+        last_of_scene[scene] = sample
 
 
 def test_a_data_set_without_scenes_is_refused(rank):
