@@ -16,9 +16,10 @@ def line(x: float) -> np.ndarray:
 
 
 def score(prior, truth) -> dict[str, float]:
-    return chamfer_report(
-        MatchTable([match_chamfer(prior, t, CHAMFER, str(i)) for i, t in enumerate(truth)]), CHAMFER
-    ).metrics
+    matches = []
+    for number, elements in enumerate(truth):
+        matches.append(match_chamfer(prior, elements, CHAMFER, str(number)))
+    return chamfer_report(MatchTable(matches), CHAMFER).metrics
 
 
 def test_the_same_map_everywhere_is_found_exactly():
@@ -40,12 +41,11 @@ def test_lines_are_averaged_in_the_point_order_nearest_to_the_first():
 
 def test_scores_order_elements_by_how_often_they_are_right():
     """The line at 0 is there always, the one at 6 in two of four samples."""
-    truth = [
-        MapElements.from_polylines([line(0.0), line(6.0)][: 1 + i % 2], [0, 0][: 1 + i % 2])
-        for i in range(4)
-    ]
+    one_line = MapElements.from_polylines([line(0.0)], [0])
+    two_lines = MapElements.from_polylines([line(0.0), line(6.0)], [0, 0])
+    truth = [one_line, two_lines, one_line, two_lines]
     prior = fit_prior(truth, CHAMFER)
-    x = [round(float(prior.polylines[i][0, 0]), 6) for i in range(len(prior))]
+    x = [round(float(polyline[0, 0]), 6) for polyline in prior.polylines]
     assert x == [0.0, 6.0]
     assert prior.scores[0] == pytest.approx(1.0)
     assert prior.scores[1] == pytest.approx(0.05 + 0.95 * 0.5)
@@ -62,7 +62,7 @@ def test_an_element_is_chosen_by_precision_and_recall():
     truth = []
     for i in range(4):
         others = [line(10.0 * (3 * i + k)) for k in range(1, 4)]
-        rings = [RING] * (i < 3)
+        rings = [RING] if i < 3 else []
         labels = [0] * 4 + [1] * len(rings)
         truth.append(MapElements.from_polylines([line(0.0), *others, *rings], labels))
     assert fit_prior(truth, CHAMFER, max_elements=1).labels.tolist() == [1]
@@ -71,10 +71,10 @@ def test_an_element_is_chosen_by_precision_and_recall():
 
 def test_refinement_moves_an_element_to_the_middle_of_what_it_matches(monkeypatch):
     """Lines within +-0.9 m, every second one turned: only the middle is within 1.0 m of all."""
-    truth = [
-        MapElements.from_polylines([line(x)[::-1] if i % 2 else line(x)], [0])
-        for i, x in enumerate(np.linspace(-0.9, 0.9, 7))
-    ]
+    truth = []
+    for i, x in enumerate(np.linspace(-0.9, 0.9, 7)):
+        points = line(x)[::-1] if i % 2 else line(x)
+        truth.append(MapElements.from_polylines([points], [0]))
     monkeypatch.setattr(prior_module, "_MAX_CANDIDATES", 1)
     prior = fit_prior(truth, CHAMFER, max_elements=1)
     assert abs(prior.polylines[0][:, 0]).max() < 0.1
@@ -82,11 +82,11 @@ def test_refinement_moves_an_element_to_the_middle_of_what_it_matches(monkeypatc
 
 
 def test_rings_that_start_elsewhere_are_averaged_as_rings():
-    rings = [
-        np.concatenate([np.roll(RING[:-1], k, axis=0), np.roll(RING[:-1], k, axis=0)[:1]])
-        for k in range(4)
-    ]
-    truth = [MapElements.from_polylines([ring + 0.1 * i], [1]) for i, ring in enumerate(rings)]
+    truth = []
+    for k in range(4):
+        corners = np.roll(RING[:-1], k, axis=0)
+        ring = np.concatenate([corners, corners[:1]])
+        truth.append(MapElements.from_polylines([ring + 0.1 * k], [1]))
     prior = fit_prior(truth, CHAMFER, max_elements=1)
     assert score(prior, truth)["chamfer/ped_crossing/AP"] == 1.0
 
@@ -94,17 +94,19 @@ def test_rings_that_start_elsewhere_are_averaged_as_rings():
 def test_the_number_of_elements_is_limited_and_fitting_is_deterministic(monkeypatch):
     monkeypatch.setattr(prior_module, "_MAX_CANDIDATES", 30)
     rng = np.random.default_rng(0)
-    truth = [
-        MapElements.from_polylines([line(x) for x in rng.uniform(-15, 15, 6)], [0] * 6)
-        for _ in range(20)
-    ]
-    first, second = (fit_prior(truth, CHAMFER, 5) for _ in range(2))
+    truth = []
+    for _ in range(20):
+        lines = [line(x) for x in rng.uniform(-15, 15, 6)]
+        truth.append(MapElements.from_polylines(lines, [0] * 6))
+    first = fit_prior(truth, CHAMFER, 5)
+    second = fit_prior(truth, CHAMFER, 5)
     assert len(first) == 5
     np.testing.assert_array_equal(first.points, second.points)
     assert (np.diff(first.scores) <= 0).all()
     larger = fit_prior(truth, CHAMFER, max_elements=10)
-    found = [score(p, truth)["chamfer/mAP"] for p in (first, larger)]
-    assert found[1] >= found[0] > 0
+    first_map = score(first, truth)["chamfer/mAP"]
+    larger_map = score(larger, truth)["chamfer/mAP"]
+    assert larger_map >= first_map > 0
 
 
 def test_no_ground_truth_is_an_error():
