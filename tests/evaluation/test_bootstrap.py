@@ -27,6 +27,10 @@ HARD = MapEvaluator(CHAMFER, HardChamferConfig.from_settings(MetricSettings(CLAS
 COUNT = 20
 
 
+def upright_line(x: float) -> np.ndarray:
+    return np.array([[x, -20.0], [x, 15.0]])
+
+
 def drive(seed: int, offset_m: float) -> list[tuple[str, str, MapElements, MapElements]]:
     """Samples of five scenes: token, scene, predictions some way off, ground truth of lines.
 
@@ -37,22 +41,21 @@ def drive(seed: int, offset_m: float) -> list[tuple[str, str, MapElements, MapEl
     for i in range(15):
         labels = rng.integers(0, 2 if i >= 3 else 3, 4)
         x = rng.uniform(-12, 12, 4)
-        lines = [np.array([[a, -20.0], [a, 15.0]]) for a in x]
         shifts = rng.exponential(offset_m, 4) * rng.choice([-1, 1], 4)
-        found = [line + np.array([dx, 0]) for line, dx in zip(lines, shifts, strict=True)]
+        lines = [upright_line(a) for a in x]
+        found = [upright_line(a) for a in x + shifts]
         scores = rng.choice(np.round(np.linspace(0.1, 0.9, 6), 2), 4, replace=False)
-        samples.append(
-            (
-                f"t{i:02d}", f"s{i // 3}",
-                MapElements.from_polylines(found, labels, scores),
-                MapElements.from_polylines(lines, labels),
-            )
-        )  # fmt: skip
+        predictions = MapElements.from_polylines(found, labels, scores)
+        truth = MapElements.from_polylines(lines, labels)
+        samples.append((f"t{i:02d}", f"s{i // 3}", predictions, truth))
     return samples
 
 
 def reports_of(samples: list, evaluator: MapEvaluator = HARD) -> list:
-    return evaluator.reports(evaluator.match(t, p, g) for t, _, p, g in samples)
+    matches = []
+    for token, _, predictions, truth in samples:
+        matches.append(evaluator.match(token, predictions, truth))
+    return evaluator.reports(matches)
 
 
 def resamples_of(samples: list) -> Resamples:
@@ -61,11 +64,12 @@ def resamples_of(samples: list) -> Resamples:
 
 def repeated(samples: list, drawn: np.ndarray) -> list:
     """The samples of a resample as a file would have them: copies with tokens of their own."""
-    return [
-        (f"{token}-{copy}", scene, predictions, truth)
-        for token, scene, predictions, truth in samples
-        for copy in range(int(drawn[int(scene[1:])]))
-    ]
+    copies = []
+    for token, scene, predictions, truth in samples:
+        num_copies = int(drawn[int(scene[1:])])
+        for copy in range(num_copies):
+            copies.append((f"{token}-{copy}", scene, predictions, truth))
+    return copies
 
 
 def test_resampled_figures_equal_those_of_files_with_the_scenes_repeated():
@@ -83,17 +87,22 @@ def test_resampled_figures_equal_those_of_files_with_the_scenes_repeated():
         wanted = {}
         for report in reports_of(repeated(samples, drawn[b])):
             wanted |= report.metrics
-        absent = [key for key, values in found.items() if np.isnan(values[b])]
-        assert all(wanted[key] == -1 for key in absent)
-        for key in found.keys() - set(absent):
-            assert found[key][b] == pytest.approx(wanted[key], abs=1e-12), (b, key)
+        for key, values in found.items():
+            if np.isnan(values[b]):
+                assert wanted[key] == -1
+            else:
+                assert values[b] == pytest.approx(wanted[key], abs=1e-12), (b, key)
     assert (drawn[:, 0] == 0).any(), "no resample is without the last class"
 
 
 def test_every_ap_has_an_interval_and_no_other_figure():
     (report, *_) = reports_of(drive(0, 0.6))
     found = ap_intervals([report], resamples_of(drive(0, 0.6)))
-    wanted = {key for key in report.metrics if key.split("/")[-1].startswith(("AP", "mAP"))}
+    wanted = set()
+    for key in report.metrics:
+        last_word = key.split("/")[-1]
+        if last_word.startswith(("AP", "mAP")):
+            wanted.add(key)
     assert set(found) == wanted
     for key, interval in found.items():
         assert interval.value == report.metrics[key]
@@ -107,7 +116,8 @@ def test_the_kernel_equals_the_metrics_own_ap(interpolated):
     rng = np.random.default_rng(1)
     for share in (0.0, 0.3, 1.0):
         hits = rng.random(60) < share
-        scene, gts = rng.integers(0, 4, 60), np.array([20.0, 0, 30, 12])
+        scene = rng.integers(0, 4, 60)
+        gts = np.array([20.0, 0, 30, 12])
         found = resampled_aps(hits[:, None], scene, np.ones((1, 4)), gts, interpolated)[0, 0]
         wanted = (interpolated_ap if interpolated else area_ap)(hits, 62)
         assert found == pytest.approx(wanted, abs=1e-14)
@@ -115,23 +125,28 @@ def test_the_kernel_equals_the_metrics_own_ap(interpolated):
 
 def test_a_difference_is_paired_scene_by_scene():
     """The same predictions with a constant gain differ less than their intervals are wide."""
-    good, bad = drive(0, 0.3), drive(0, 0.9)
+    good = drive(0, 0.3)
+    bad = drive(0, 0.9)
     resamples = resamples_of(good)
     found = ap_differences(reports_of(good), reports_of(bad), resamples)["chamfer/mAP"]
-    ours, theirs = (reports_of(s)[0].metrics["chamfer/mAP"] for s in (good, bad))
+    ours = reports_of(good)[0].metrics["chamfer/mAP"]
+    theirs = reports_of(bad)[0].metrics["chamfer/mAP"]
     assert found.value == ours - theirs
     assert 0 < found.low < found.value < found.high
     same = ap_differences(reports_of(good), reports_of(good), resamples)
-    assert all((i.value, i.low, i.high) == (0, 0, 0) for i in same.values())
+    for interval in same.values():
+        assert (interval.value, interval.low, interval.high) == (0, 0, 0)
     with pytest.raises(ValueError, match="only if their samples and metrics are equal"):
         ap_differences(reports_of(good), reports_of(bad[:-1]), resamples)
 
 
 def test_resamples_are_repeatable_and_need_scenes():
     scenes = {f"t{i}": f"s{i}" for i in range(6)}
-    draw = [Resamples(scenes, 50, seed).draw_copies(list(scenes))[1] for seed in (0, 0, 1)]
-    np.testing.assert_array_equal(draw[0], draw[1])
-    assert (draw[0] != draw[2]).any()
+    _, first = Resamples(scenes, 50, 0).draw_copies(list(scenes))
+    _, again = Resamples(scenes, 50, 0).draw_copies(list(scenes))
+    _, other = Resamples(scenes, 50, 1).draw_copies(list(scenes))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
     with pytest.raises(ValueError, match="two scenes, two resamples"):
         Resamples({"a": "s", "b": "s"})
     with pytest.raises(ValueError, match="scene of sample 'x' is not known"):
@@ -163,6 +178,8 @@ def test_hard_thresholds_beside_the_others_are_those_of_their_own_run(tmp_path):
     alone = replace(CHAMFER, thresholds=(0.2, 0.5, 1.0))
     (hard,) = reports_of(samples, MapEvaluator(alone))
     assert both[0].metrics == easy.metrics
-    renamed = {key.replace("chamfer/", "chamfer_hard/"): v for key, v in hard.metrics.items()}
+    renamed = {}
+    for key, value in hard.metrics.items():
+        renamed[key.replace("chamfer/", "chamfer_hard/")] = value
     assert both[1].metrics == renamed
     assert set(both[1].detections) == set(CLASSES)
