@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from sample_cases import META, sample
 
 from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.transforms.corruptions import (
     KINDS,
     SEVERITIES,
@@ -40,6 +42,18 @@ def results(views: int = 6, token: str = "a") -> dict:
     }
 
 
+def num_black(found: dict) -> int:
+    return sum(not image.any() for image in found["img"])
+
+
+def images_of(frame: MapSample, root: Path, **values: object) -> dict[str, dict]:
+    """What a pipeline starts from: the path of the image of each camera, and further values."""
+    images = {}
+    for camera in frame.cameras:
+        images[camera.name] = {"img_path": str(root / camera.path), **values}
+    return images
+
+
 def error_of(kind: str, severity: int, seed: int = 0) -> float:
     found = CorruptImages(kind, severity, seed).transform(results(1))
     return float(np.abs(found["img"][0].astype(float) - results(1)["img"][0]).mean())
@@ -59,8 +73,10 @@ def test_seed_and_token_decide_what_is_drawn(kind):
         return CorruptImages(kind, 3, seed).transform(results(token=token))
 
     def same(first: dict, second: dict) -> bool:
-        keys = ("img", "lidar2cam", "lidar2img")
-        return all(np.array_equal(first[key], second[key]) for key in keys)
+        for key in ("img", "lidar2cam", "lidar2img"):
+            if not np.array_equal(first[key], second[key]):
+                return False
+        return True
 
     assert same(of(0, "a"), of(0, "a"))
     drawn = kind not in ("fog", "motion_blur", "jpeg")
@@ -79,9 +95,10 @@ def test_lost_cameras_are_black_look_nowhere_and_add_up():
             np.testing.assert_array_equal(found["lidar2cam"][view], expected)
             np.testing.assert_allclose(found["lidar2img"][view], INNER @ expected)
         lost.append(black)
-    assert all(fewer < more for fewer, more in pairwise(lost))
+    for fewer, more in pairwise(lost):
+        assert fewer < more
     pair = CorruptImages("camera_lost", 5).transform(results(2))
-    assert sum(image.any() for image in pair["img"]) == 1
+    assert num_black(pair) == 1  # the last camera stays
 
 
 def test_calibration_is_off_by_the_degrees_and_centimetres_that_are_said():
@@ -123,32 +140,32 @@ def test_unknown_corruptions_are_refused(kind, severity):
 
 def test_delayed_cameras_show_the_sample_before(tmp_path):
     """The second sample of a scene shows some images of the first; the first one stays."""
-    rows = [sample(number, timestamp_ns=10 - number) for number in (0, 1)]  # 1 comes before 0
-    rows.append(replace(sample(2), scene="another"))
-    write_annotations(tmp_path / "a.arrow", META, rows)
+    second = sample(0, timestamp_ns=10)
+    first = sample(1, timestamp_ns=9)
+    other = replace(sample(2), scene="another")
+    write_annotations(tmp_path / "a.arrow", META, [second, first, other])
     step = DelayCameras("a.arrow", severity=5, data_root=str(tmp_path))
-    for row, expected in zip(rows, (["0.jpg", "1.jpg"], ["1.jpg"], ["2.jpg"]), strict=True):
-        images = {c.name: {"img_path": str(tmp_path / c.path), "size": 1} for c in row.cameras}
-        given = {name: dict(image) for name, image in images.items()}
+    cases = [(second, {"0.jpg", "1.jpg"}), (first, {"1.jpg"}), (other, {"2.jpg"})]
+    for row, expected in cases:
+        images = images_of(row, tmp_path, size=1)
         found = step.transform({"token": row.token, "images": images})["images"]
-        names = {image["img_path"].rsplit("/", 1)[1] for image in found.values()}
-        assert sorted(names) == expected
-        assert images == given
+        assert {Path(image["img_path"]).name for image in found.values()} == expected
+        assert images == images_of(row, tmp_path, size=1)  # the input has not changed
         for name, image in found.items():
             assert name in image["img_path"]
             assert image["size"] == 1
 
 
 def test_a_camera_that_the_sample_before_lacks_is_not_delayed(tmp_path):
-    before, now = sample(0, timestamp_ns=1), sample(1, timestamp_ns=2)
-    before = replace(before, cameras=before.cameras[:1])
+    complete = sample(0, timestamp_ns=1)
+    before = replace(complete, cameras=complete.cameras[:1])
+    now = sample(1, timestamp_ns=2)
     write_annotations(tmp_path / "a.arrow", META, [before, now])
     step = DelayCameras("a.arrow", severity=5, data_root=str(tmp_path))
-    images = {c.name: {"img_path": str(tmp_path / c.path)} for c in now.cameras}
-    found = step.transform({"token": now.token, "images": images})["images"]
-    kept, late = now.cameras[0], before.cameras[0]
-    assert found.pop(kept.name)["img_path"] == str(tmp_path / late.path)
-    assert found == {name: image for name, image in images.items() if name != kept.name}
+    expected = images_of(now, tmp_path)
+    expected[now.cameras[0].name]["img_path"] = str(tmp_path / before.cameras[0].path)
+    found = step.transform({"token": now.token, "images": images_of(now, tmp_path)})["images"]
+    assert found == expected
 
 
 def test_training_drops_some_cameras_of_some_samples():
@@ -157,9 +174,9 @@ def test_training_drops_some_cameras_of_some_samples():
     counts = []
     for _ in range(200):
         found = step.transform(results())
-        counts.append(sum(not image.any() for image in found["img"]))
+        counts.append(num_black(found))
         away = sum(np.array_equal(matrix, OUT_OF_SIGHT) for matrix in found["lidar2cam"])
         assert away == counts[-1]
     shares = np.bincount(counts, minlength=4) / 200
     np.testing.assert_allclose(shares, [0.5, 1 / 6, 1 / 6, 1 / 6], atol=0.09)
-    assert sum(image.any() for image in DropCameras(1.0, 9).transform(results(2))["img"]) == 1
+    assert num_black(DropCameras(1.0, 9).transform(results(2))) == 1
