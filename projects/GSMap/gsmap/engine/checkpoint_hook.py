@@ -78,7 +78,8 @@ def _pass_model_facts(loop: Any, path: Path, meta: dict[str, Any]) -> None:
     facts: dict[str, Any] = {CALIBRATION: calibration_of(meta)}
     if path.is_file():  # there is no digest of an address
         facts[CHECKPOINT] = digest(path)
-    loop.evaluator.dataset_meta = {**(loop.evaluator.dataset_meta or {}), **facts}
+    data_facts = loop.evaluator.dataset_meta or {}
+    loop.evaluator.dataset_meta = {**data_facts, **facts}
 
 
 def _described_datasets(runner: Runner) -> list[Any]:
@@ -118,7 +119,8 @@ def _warn_of_differences(runner: Runner) -> None:
             f"The training data sets have scaled images of {' and '.join(texts)} pixels, so the "
             "checkpoints store no size, and inference scales images as its config says."
         )
-    if len({dataset.has_signals() for dataset in datasets}) > 1:
+    have_signals = {dataset.has_signals() for dataset in datasets}
+    if len(have_signals) > 1:
         runner.logger.warning(
             "Some training data sets have vehicle signals and others have none: inference will "
             "compute missing signals from the poses."
@@ -233,8 +235,10 @@ class AtomicCheckpointHook(CheckpointHook):
             FloatingPointError: If a loss or a weight is not finite.
         """
         finish_checks(runner)  # raises the error of a loss that was not finite
-        state = checkpoint["state_dict"]
-        nonfinite_keys = [key for key, value in state.items() if not bool(value.isfinite().all())]
+        nonfinite_keys = []
+        for key, value in checkpoint["state_dict"].items():
+            if not bool(value.isfinite().all()):
+                nonfinite_keys.append(key)
         if nonfinite_keys:
             raise NotFiniteError(
                 f"weights are NaN or infinite ({summarize_names(nonfinite_keys)}), so they are not "
