@@ -141,17 +141,14 @@ class MapHead(LossHead):
         # The first half of the channels is positional, the second half is content.
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
         self.pts_embedding = self._build_point_embedding(point_queries)
-        self.cls_branches = nn.ModuleList(
-            classification_branch(embed_dims, len(self.classes)) for _ in range(num_layers)
-        )
+        num_classes = len(self.classes)
+        self.cls_branches = nn.ModuleList()
+        for _ in range(num_layers):
+            self.cls_branches.append(classification_branch(embed_dims, num_classes))
         self.loss_cls = MODELS.build(loss_cls)
-        # A config removes an inherited loss by setting it to None.
-        self.losses = modules_by_name([MODELS.build(loss) for loss in losses if loss])
-        self.aux_heads = modules_by_name(
-            [build_part(aux_head, embed_dims=embed_dims) for aux_head in aux_heads]
-        )
-        sizes = {"embed_dims": embed_dims, "num_classes": len(self.classes)}
-        self.flow_parts = modules_by_name([build_part(part, **sizes) for part in flow_parts])
+        self.losses = _build_losses(losses)
+        self.aux_heads = _build_parts(aux_heads, embed_dims=embed_dims)
+        self.flow_parts = _build_parts(flow_parts, embed_dims=embed_dims, num_classes=num_classes)
         self.assigner = MapAssigner(match_costs)
         self.coder = self.build_coder(coder or {})
         self.check_parts()
@@ -215,7 +212,8 @@ class MapHead(LossHead):
                 )
         names = ["cls", *self.losses]
         check_unique_names([*names, *self.aux_heads, *self.flow_parts], "losses")
-        check_unique_names([group.name for group in self.query_groups], "query groups")
+        group_names = [group.name for group in self.query_groups]
+        check_unique_names(group_names, "query groups")
         for group in self.query_groups:
             unknown = sorted(set(group.losses or ()) - set(names))
             if unknown:
@@ -392,7 +390,8 @@ class MapHead(LossHead):
             The detections of each sample.
         """
         metas = [sample.metainfo for sample in batch_data_samples]
-        return self.predict_by_feat(self(bev_outputs, hooks), metas)
+        layers = self(bev_outputs, hooks)
+        return self.predict_by_feat(layers, metas)
 
     def loss(
         self,
@@ -413,7 +412,8 @@ class MapHead(LossHead):
         Returns:
             Scalars by name.
         """
-        truths = self.prepare_gts([sample.gt_instances_3d for sample in batch_data_samples])
+        annotated = [sample.gt_instances_3d for sample in batch_data_samples]
+        truths = self.prepare_gts(annotated)
         metas = [sample.metainfo for sample in batch_data_samples]
         part_hooks = []
         for part in cast(Sequence[FlowPart], self.flow_parts.values()):
@@ -427,3 +427,18 @@ class MapHead(LossHead):
         for name, head in self.aux_heads.items():
             losses[f"loss_{name}"] = cast(AuxHead, head).loss(bev_outputs, batch_data_samples)
         return losses
+
+
+def _build_losses(configs: Sequence[PartConfig]) -> nn.ModuleDict:
+    """Losses by name, without inherited ones that a config removes by setting them to None."""
+    losses = []
+    for config in configs:
+        if config:
+            losses.append(MODELS.build(config))
+    return modules_by_name(losses)
+
+
+def _build_parts(configs: Sequence[PartConfig], **defaults: Any) -> nn.ModuleDict:
+    """Parts by name."""
+    parts = [build_part(config, **defaults) for config in configs]
+    return modules_by_name(parts)
