@@ -198,7 +198,11 @@ def _add_crossings(road: Road, rng: np.random.Generator) -> None:
 
 def road_surface(road: Road) -> list[Polygon]:
     """Kerb-to-kerb polygons of a road, in metres."""
-    return [Polygon(road.band_with_mouths(right, left)) for right, left in road.carriageways()]
+    surfaces = []
+    for right, left in road.carriageways():
+        outline = road.band_with_mouths(right, left)
+        surfaces.append(Polygon(outline))
+    return surfaces
 
 
 def _add_surroundings(town: Town, rng: np.random.Generator) -> None:
@@ -223,17 +227,24 @@ def _add_surroundings(town: Town, rng: np.random.Generator) -> None:
         pavements.append(outline.buffer(2.5))
     streets = shapely.union_all(surfaces)  # roads and junctions, without car parks
     # The outline of a road in a sharp bend may cross itself, which `buffer(0)` repairs.
-    blocked = shapely.union_all([p.buffer(0) for p in [*pavements, *medians, *surfaces]])
+    areas = [*pavements, *medians, *surfaces]
+    blocked = shapely.union_all([area.buffer(0) for area in areas])
     _add_carparks(town, blocked, rng=rng)
-    parks = [Polygon(p.outline).union(Polygon(p.driveway)) for p in town.carparks]
+    parks = []
+    for carpark in town.carparks:
+        park = Polygon(carpark.outline).union(Polygon(carpark.driveway))
+        parks.append(park)
     town.drivable = shapely.union_all([streets, *parks])
     # Pavements are the parts of these outlines that are neither for vehicles nor medians. Slivers
     # are left out.
-    outlines = shapely.union_all([p.buffer(0) for p in pavements])
+    outlines = shapely.union_all([pavement.buffer(0) for pavement in pavements])
     all_medians = shapely.union_all(medians)
-    pieces = shapely.get_parts(outlines.difference(town.drivable).difference(all_medians))
-    town.walkways = [p for p in pieces if p.geom_type == "Polygon" and p.area > 0.5]
-    park_margins = [p.buffer(1.0) for p in parks]
+    walkways = outlines.difference(town.drivable).difference(all_medians)
+    town.walkways = []
+    for piece in shapely.get_parts(walkways):
+        if piece.geom_type == "Polygon" and piece.area > 0.5:
+            town.walkways.append(piece)
+    park_margins = [park.buffer(1.0) for park in parks]
     without_houses = shapely.union_all([blocked.buffer(0.6), *park_margins])
     _add_buildings(town, blocked=without_houses, rng=rng)
     _add_furniture(town, rng)
