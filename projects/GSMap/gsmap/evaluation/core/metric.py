@@ -96,7 +96,8 @@ class ValueTable:
 
     def column(self, name: str) -> list[npt.NDArray[Any]]:
         """Return the array ``name`` of each of the S samples, in the order of the tokens."""
-        return [self._records[token].values[name] for token in self.tokens]
+        records = [self._records[token] for token in self.tokens]
+        return [record.values[name] for record in records]
 
 
 @dataclass(frozen=True)
@@ -273,9 +274,11 @@ def new_table(matches: Matches) -> MatchTable | ValueTable:
 
 def arrays_of(matches: Matches) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of the record of a sample, by name."""
-    if isinstance(matches, SampleValues):
-        return {name: np.asarray(values) for name, values in matches.values.items()}
     arrays = {}
+    if isinstance(matches, SampleValues):
+        for name, values in matches.values.items():
+            arrays[name] = np.asarray(values)
+        return arrays
     for name, values in vars(matches).items():
         if name != "token" and values is not None:  # None: the metric does not have this array
             arrays[name] = np.asarray(values)
@@ -315,7 +318,10 @@ def _fits_record(shapes: Mapping[str, _Shape], expected: Mapping[str, _Shape]) -
     """Whether arrays have the names and the shapes of an empty sample."""
     if shapes.keys() != expected.keys():
         return False
-    return all(_fits_shape(shapes[name], empty_shape=expected[name]) for name in expected)
+    for name, empty_shape in expected.items():
+        if not _fits_shape(shapes[name], empty_shape=empty_shape):
+            return False
+    return True
 
 
 def _fits_shape(shape: _Shape, empty_shape: _Shape) -> bool:
