@@ -219,7 +219,9 @@ def match_raster(
 def _mean(values: Iterable[float]) -> float:
     """Compute the mean of the values that are not ``UNDEFINED`` (-1); -1 if there are none."""
     defined = [value for value in values if value != UNDEFINED]
-    return float(np.mean(defined)) if defined else UNDEFINED
+    if not defined:
+        return UNDEFINED
+    return float(np.mean(defined))
 
 
 def _class_figures(ranked: ClassDetections, ious: FloatArray) -> dict[str, float]:
@@ -275,10 +277,13 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
     metrics["mIoU"] = _mean(values["mIoU"] for values in figures.values())
     metrics["num_absent_classes"] = float(len(config.classes) - num_present)
     metrics["num_samples"] = float(len(matches))
+    prefixed = {}
+    for key, value in metrics.items():
+        prefixed[f"raster/{key}"] = value
     return MetricReport(
         name="raster",
         groups=groups,
-        metrics={f"raster/{key}": value for key, value in metrics.items()},
+        metrics=prefixed,
         detections=detections,
         tokens=matches.tokens,
         by_distance=False,  # thresholds are IoUs, not distances

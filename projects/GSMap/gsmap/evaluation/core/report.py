@@ -55,7 +55,9 @@ class MetricReport:
         Returns:
             Report without groups and detections. `format_table` lists its figures in rows.
         """
-        metrics = {f"{name}/{key}": float(value) for key, value in figures.items()}
+        metrics = {}
+        for key, value in figures.items():
+            metrics[f"{name}/{key}"] = float(value)
         return cls(name, groups={}, metrics=metrics, detections={}, tokens=tokens)
 
 
@@ -126,7 +128,8 @@ def format_table(report: MetricReport) -> str:
     A metric that ranks no predictions has a row per figure.
     """
     if not report.groups:
-        return "\n".join(f"{key:<44} {value:.4f}" for key, value in report.metrics.items())
+        figure_lines = [f"{key:<44} {value:.4f}" for key, value in report.metrics.items()]
+        return "\n".join(figure_lines)
 
     lines = [f"AP_{report.name}"]
     for group in report.groups:
@@ -174,8 +177,10 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
     class_keys += ["num_gts", "num_preds"]
     rows = [(group, titles)]
     for name in names:
-        rows.append((name, [_cell(report, f"{name}/{key}") for key in class_keys]))
-    rows.append(("mean", [_cell(report, key) for key in mean_keys]))
+        class_cells = [_cell(report, f"{name}/{key}") for key in class_keys]
+        rows.append((name, class_cells))
+    mean_cells = [_cell(report, key) for key in mean_keys]
+    rows.append(("mean", mean_cells))
 
     name_width = max(len(name) for name, _ in rows)
     lines = []
