@@ -58,7 +58,8 @@ class MapEvaluator:
         object.__setattr__(self, "metrics", metrics)
         object.__setattr__(self, "ground_truth_points", ground_truth_points)
         names = [metric.name for metric in metrics]
-        if len({metric.classes for metric in metrics}) != 1:
+        class_lists = {metric.classes for metric in metrics}
+        if len(class_lists) != 1:
             raise InputError("give at least one metric; all metrics must have equal classes.")
         if len(set(names)) != len(names):
             raise InputError(f"the metrics must have different names, got {names}.")
@@ -188,10 +189,12 @@ class MapEvaluator:
 
     def match_all(self, samples: Iterable[Sample]) -> list[SampleMatches]:
         """Match several samples under every metric. The records are in the order of the samples."""
-        return [
-            self.match(sample.token, sample.predictions, ground_truth=sample.ground_truth)
-            for sample in samples
-        ]
+        matches = []
+        for sample in samples:
+            matches.append(
+                self.match(sample.token, sample.predictions, ground_truth=sample.ground_truth)
+            )
+        return matches
 
     def reports(self, samples: Iterable[SampleMatches]) -> list[MetricReport]:
         """Compute the metrics from the records of all samples; repeated tokens count once.

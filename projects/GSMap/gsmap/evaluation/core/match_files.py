@@ -71,9 +71,14 @@ def write_matches(
     Returns:
         Path of the file of the shard.
     """
+    note_texts = []
+    note_numbers = []
+    for number, text in notes:
+        note_numbers.append(number)
+        note_texts.append(text)
     arrays: dict[str, npt.NDArray[Any]] = {
-        "notes": np.array([text for _, text in notes], dtype=str),
-        "note_numbers": np.array([number for number, _ in notes], dtype=np.int64),
+        "notes": np.array(note_texts, dtype=str),
+        "note_numbers": np.array(note_numbers, dtype=np.int64),
     }
     for metric in evaluator.metrics:
         records = [sample[metric.name] for sample in matches]
@@ -190,7 +195,9 @@ def _split_records(arrays: Arrays, metric: str, like: Matches) -> Iterator[Match
             raise InputError(f"{metric}/{name} has {len(values)} rows, its samples have {ends}")
         columns[name] = np.split(values, ends[:-1])
     for number, token in enumerate(tokens):
-        sample_arrays = {name: values[number] for name, values in columns.items()}
+        sample_arrays = {}
+        for name, values in columns.items():
+            sample_arrays[name] = values[number]
         yield matches_of(str(token), arrays=sample_arrays, like=like)
 
 
