@@ -31,16 +31,10 @@ class _LateNorm(OptimWrapper):
     def _clip_grad(self) -> None:
         """Clip the gradients. The overridden method of mmengine would wait for the norm."""
         params: list[Tensor] = []
-        for group in self.optimizer.param_groups:
-            params.extend(group["params"])
-        model_indices: list[int] = []
-        for indices in self.members:
-            model_indices.extend(indices)
-        if model_indices:
-            # Sum the norms in the order of the model, so that rounding does not depend on groups.
-            indexed_params = sorted(zip(model_indices, params, strict=True), key=itemgetter(0))
-            params = [param for _, param in indexed_params]
-        params = [p for p in params if p.requires_grad and p.grad is not None]
+        # Sum the norms in the order of the model, so that rounding does not depend on groups.
+        for param in self._params_in_model_order():
+            if param.requires_grad and param.grad is not None:
+                params.append(param)
         if not params:
             return
         norm = self.clip_func(params, **self.clip_grad_kwargs)
@@ -48,6 +42,19 @@ class _LateNorm(OptimWrapper):
             # `keep_figures` adds the norm to the log; a value on a GPU is copied only when the log
             # is read.
             keep_figures(self.message_hub, figures={f"train/{self.grad_name}": norm})
+
+    def _params_in_model_order(self) -> list[Tensor]:
+        """Parameters of all groups; in the order of the groups if they are not merged."""
+        params: list[Tensor] = []
+        for group in self.optimizer.param_groups:
+            params.extend(group["params"])
+        model_indices: list[int] = []
+        for indices in self.members:
+            model_indices.extend(indices)
+        if not model_indices:
+            return params
+        indexed_params = sorted(zip(model_indices, params, strict=True), key=itemgetter(0))
+        return [param for _, param in indexed_params]
 
 
 @OPTIM_WRAPPERS.register_module()
@@ -185,7 +192,9 @@ class MergedGroupsConstructor(DefaultOptimWrapperConstructor):
 
 def _group_settings(group: dict[str, Any]) -> dict[str, Any]:
     """Return a parameter group without its parameters."""
-    return {name: value for name, value in group.items() if name != "params"}
+    settings = dict(group)
+    settings.pop("params", None)
+    return settings
 
 
 def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
@@ -223,6 +232,7 @@ def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
                 if name not in scheduler:
                     continue
                 values = scheduler[name]
+                # The settings of the parameters of a merged group are equal: take the first one's.
                 group_values = [values[indices[0]] for indices in members]
                 extra_values = values[param_count : param_count + num_extra_groups]
                 scheduler[name] = group_values + extra_values
