@@ -65,8 +65,10 @@ class KeyMap:
 
     def to_upstream(self, key: str) -> str | None:
         """Upstream key for a key of this project, or None if no rule matches."""
-        reversed_rules = tuple((ours, upstream) for upstream, ours in self.rules)
-        return _rename(key, rules=reversed_rules)
+        reversed_rules = []
+        for upstream, ours in self.rules:
+            reversed_rules.append((ours, upstream))
+        return _rename(key, rules=tuple(reversed_rules))
 
 
 def _pattern(template: str) -> re.Pattern[str]:

@@ -37,7 +37,9 @@ def neutral_keys(model: nn.Module, prefix: str = "") -> list[set[str]]:
             continue
         path = f"{prefix}{name}." if name else prefix
         for relative_prefix in module.neutral_keys:
-            groups.append({key for key in state if key.startswith(path + relative_prefix)})
+            full_prefix = path + relative_prefix
+            keys = {key for key in state if key.startswith(full_prefix)}
+            groups.append(keys)
     return groups
 
 
@@ -70,7 +72,9 @@ def adapt_state(
         ValueError: If a key is missing or left over, or a weight has another shape. Also if neutral
             keys are missing although ``allow_untrained`` is False.
     """
-    bare_state = {key.removeprefix(prefix): value for key, value in state.items()}
+    bare_state = {}
+    for key, value in state.items():
+        bare_state[key.removeprefix(prefix)] = value
     if is_upstream(bare_state):
         state.clear()  # the dictionary of the caller is filled with the renamed keys
         for key, value in ours_from_upstream(bare_state).items():
