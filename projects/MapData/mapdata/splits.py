@@ -66,7 +66,8 @@ def _families() -> list[str]:
     """Names of the files of published lists, in the order in which their splits are offered."""
     # Backwards, so that the published lists of disjoint places come first.
     folder = files("mapdata").joinpath("split_lists")
-    return sorted((Path(file.name).stem for file in folder.iterdir()), reverse=True)
+    names = [Path(file.name).stem for file in folder.iterdir()]
+    return sorted(names, reverse=True)
 
 
 def split_names(dataset: str) -> tuple[str, ...]:
@@ -147,7 +148,8 @@ def _read_lines(path: Path) -> dict[str, list[str]]:
     Raises:
         ValueError: If the file's name has none of the words of `_PARTS`, or two different ones.
     """
-    words = [word for word in re.split(r"[^a-z]+", path.stem.lower()) if word in _PARTS]
+    all_words = re.split(r"[^a-z]+", path.stem.lower())
+    words = [word for word in all_words if word in _PARTS]
     if len(set(words)) != 1:
         raise InputError(f"the name of {path} must have one of the words {', '.join(_PARTS)}")
     scenes = []

@@ -83,9 +83,10 @@ def read_poses(path: Path, time_of: Mapping[str, int | None], ground: np.ndarray
 def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield the line number and the values by column of each row below the names of the columns."""
     lines = text.splitlines()
-    # Index of the first line that is not blank.
-    start = next((number for number, line in enumerate(lines) if line.strip()), None)
-    if start is None:
+    start = 0  # index of the first line that is not blank
+    while start < len(lines) and not lines[start].strip():
+        start += 1
+    if start == len(lines):
         raise InputError("it is empty")
     separator = max(_SEPARATORS, key=lines[start].count)  # the most frequent one of the first line
     table = csv.reader(lines[start:], delimiter=separator, skipinitialspace=True)
