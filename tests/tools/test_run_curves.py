@@ -21,28 +21,28 @@ from gsmap.visualization.figure import figure_to_rgb
 def write_log(folder, start, records):
     path = folder / start / "vis_data" / "scalars.json"
     path.parent.mkdir(parents=True)
-    path.write_text("\n".join(json.dumps(r) for r in records))
+    lines = [json.dumps(record) for record in records]
+    path.write_text("\n".join(lines))
     return path
 
 
 @pytest.fixture
 def run(tmp_path):
     folder = tmp_path / "demo"
-    train = [
-        {"loss": 8.0 / s, "loss_pts": 4.0 / s, "d0.loss_pts": 5.0 / s, "time": 0.5, "step": s}
-        for s in (1, 2, 4)
+    first = [
+        {"loss": 8.0, "loss_pts": 4.0, "d0.loss_pts": 5.0, "time": 0.5, "step": 1},
+        {"loss": 4.0, "loss_pts": 2.0, "d0.loss_pts": 2.5, "time": 0.5, "step": 2},
+        {"loss": 2.0, "loss_pts": 1.0, "d0.loss_pts": 1.25, "time": 0.5, "step": 4},
+        {"chamfer/mAP": 0.25, "time": 0.1, "step": 1},
     ]
-    write_log(folder, "20260101_000000", [*train, {"chamfer/mAP": 0.25, "time": 0.1, "step": 1}])
-    later = [{"loss": 1.0, "loss_pts": 0.5, "time": 0.7, "step": s} for s in (4, 8)]
-    write_log(
-        folder,
-        "20260102_000000",
-        [
-            *later,
-            {"chamfer/mAP": 0.75, "chamfer/divider/AP": 0.9, "step": 2},
-            {"chamfer/mAP": 0.5, "step": 3},
-        ],
-    )
+    write_log(folder, "20260101_000000", first)
+    later = [
+        {"loss": 1.0, "loss_pts": 0.5, "time": 0.7, "step": 4},
+        {"loss": 1.0, "loss_pts": 0.5, "time": 0.7, "step": 8},
+        {"chamfer/mAP": 0.75, "chamfer/divider/AP": 0.9, "step": 2},
+        {"chamfer/mAP": 0.5, "step": 3},
+    ]
+    write_log(folder, "20260102_000000", later)
     return folder
 
 
@@ -56,10 +56,10 @@ def test_resumed_run_is_joined_and_the_later_record_counts(run):
 
 
 def test_table_gives_last_and_best(run):
-    rows = [
-        [c.strip() for c in line.split("|")[1:-1]]
-        for line in summary_table([read_run(run)]).split("\n")
-    ]
+    rows = []
+    for line in summary_table([read_run(run)]).split("\n"):
+        cells = line.split("|")[1:-1]
+        rows.append([cell.strip() for cell in cells])
     assert rows[0][-1] == "chamfer/mAP (last / best)"
     assert rows[2] == ["demo", "8", "8", "1", "0.6", "0.5 / 0.75"]
 
@@ -74,8 +74,12 @@ def test_plot_shows_total_parts_and_metrics(run):
 
 
 def test_chosen_figures_have_a_panel_each(tmp_path):
-    log = [{"loss": 1.0, "at_floor": share, "step": i} for i, share in enumerate((0.5, 0.25), 1)]
-    first, second = (read_run(write_log(tmp_path, name, log), name) for name in "ab")
+    log = [
+        {"loss": 1.0, "at_floor": 0.5, "step": 1},
+        {"loss": 1.0, "at_floor": 0.25, "step": 2},
+    ]
+    first = read_run(write_log(tmp_path, "a", log), "a")
+    second = read_run(write_log(tmp_path, "b", log), "b")
     (panel,) = plot_series([first, second], ["at_floor"]).axes
     assert [line.get_label() for line in panel.lines[1::2]] == ["a", "b"]
     np.testing.assert_allclose(panel.lines[0].get_ydata(), [0.5, 0.25])
@@ -134,10 +138,12 @@ def test_missing_log_and_no_runs(tmp_path):
 
 def test_validations_stand_at_the_ends_of_their_epochs_though_the_last_was_cut_off(tmp_path):
     log = [
-        {"loss": 1.0, "step": step, "epoch": epoch}
-        for step, epoch in ((200, 1), (400, 1), (450, 2))
+        {"loss": 1.0, "step": 200, "epoch": 1},
+        {"loss": 1.0, "step": 400, "epoch": 1},
+        {"loss": 1.0, "step": 450, "epoch": 2},
+        {"chamfer/mAP": 0.5, "step": 1},
     ]
-    run = read_run(write_log(tmp_path, "a", [*log, {"chamfer/mAP": 0.5, "step": 1}]), "a")
+    run = read_run(write_log(tmp_path, "a", log), "a")
     (panel,) = plot_iterations([SimpleNamespace(name="a", log=run)]).axes
     assert panel.lines[0].get_xdata().tolist() == [400]
 

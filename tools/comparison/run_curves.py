@@ -90,13 +90,14 @@ def _records(path: Path) -> list[dict[str, float]]:
             for key, value in record.items():
                 if isinstance(value, int | float):
                     scalars[key] = float(value)
-            records.append(scalars)
+            if "step" in scalars:
+                records.append(scalars)
         # An `InputError` is a ValueError. A number beyond the range of float is an OverflowError.
         except (ValueError, OverflowError) as error:
             if number == len(lines):  # the unfinished last line
                 break
             raise InputError(f"{path}, line {number} is not JSON: {error}.") from error
-    return [record for record in records if "step" in record]
+    return records
 
 
 def read_run(path: str | Path, name: str | None = None) -> RunLog:
@@ -181,7 +182,8 @@ def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
             steps, values = run.series(name, validation=True)
             ax.plot(steps, values, style, color=colour, marker=".", label=label)
     by_epoch = any("epoch" in logged_keys(run.train) for run in runs)
-    _finish(ax, "validation", "epoch" if by_epoch else "iteration")
+    x_label = "epoch" if by_epoch else "iteration"
+    _finish(ax, "validation", x_label)
     ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
@@ -299,7 +301,8 @@ def summary_table(runs: Sequence[RunLog]) -> str:
     for run in runs:
         names += [name for name in run.metrics if name not in names]
     header = ["run", "iterations", "loss (first)", "loss (last)", "s / iteration"]
-    header += [f"{name} (last / best)" for name in names]
+    for name in names:
+        header.append(f"{name} (last / best)")
     rows = [header]
     for run in runs:
         steps, loss = run.series("loss")
@@ -316,8 +319,12 @@ def summary_table(runs: Sequence[RunLog]) -> str:
             last_and_best = f"{values[-1]:.4g} / {values.max():.4g}" if len(values) else "-"
             row.append(last_and_best)
         rows.append(row)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows.insert(1, ["-" * width for width in widths])
+    widths = [0] * len(header)
+    for row in rows:
+        for column, cell in enumerate(row):
+            widths[column] = max(widths[column], len(cell))
+    separator = ["-" * width for width in widths]
+    rows.insert(1, separator)
     lines = []
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
