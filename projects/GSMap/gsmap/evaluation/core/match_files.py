@@ -196,8 +196,8 @@ def _split_records(arrays: Arrays, metric: str, like: Matches) -> Iterator[Match
         columns[name] = np.split(values, ends[:-1])
     for number, token in enumerate(tokens):
         sample_arrays = {}
-        for name, values in columns.items():
-            sample_arrays[name] = values[number]
+        for name, parts in columns.items():
+            sample_arrays[name] = parts[number]
         yield matches_of(str(token), arrays=sample_arrays, like=like)
 
 
