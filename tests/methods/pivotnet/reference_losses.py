@@ -1,7 +1,7 @@
 """PivotNet's targets, matching, losses and what is decoded."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import chain, permutations, product
+from itertools import product
 from typing import ClassVar
 
 import numpy as np
@@ -27,9 +27,12 @@ GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
 @check("pivotnet_matching_{variant}.npz")
 def check_matching(golden: Golden, name: str) -> Iterator[Row]:
     """Compare both dynamic programmes."""
-    data, recipe = golden.read_arrays(name), golden.recipe("pivotnet")
-    wrong, off = 0, 0.0
-    for index in range(sum(key.startswith("dp_size") for key in data)):
+    data = golden.read_arrays(name)
+    recipe = golden.recipe("pivotnet")
+    wrong = 0
+    off = 0.0
+    num_cases = sum(key.startswith("dp_size") for key in data)
+    for index in range(num_cases):
         shape = tuple(data[f"dp_size{index}"])
         costs = recipe.uniform(f"pv_cost{index}", shape, seed=golden.seed)
         wrong += not np.array_equal(match_pivots(costs), data[f"dp_match{index}"])
@@ -42,12 +45,8 @@ def check_matching(golden: Golden, name: str) -> Iterator[Row]:
     for weight in (0, 5):
         ours = sequence_costs(batch[None], data["batch_lens"], weight)[0]
         wanted = data[f"batch_cost_endpoints{weight}"]
-        yield Row(
-            name,
-            f"lines without a path, ends + {weight}",
-            (np.isinf(ours) ^ np.isinf(wanted)).sum(),
-            0,
-        )
+        differing = (np.isinf(ours) ^ np.isinf(wanted)).sum()
+        yield Row(name, f"lines without a path, ends + {weight}", differing, 0)
         finite = np.isfinite(wanted)
         off = max(off, largest_relative(ours[finite], wanted[finite]))
     yield Row(name, "costs (relative)", off, 1e-6)
@@ -59,39 +58,33 @@ def check_pivots(golden: Golden, name: str) -> Iterator[Row]:
     data = golden.read_arrays(name)
     grid = GRID.rasterized(0.15)
     for tag in ("closed", "many"):
-        thick, thin = FormatPivotTargets(), FormatPivotTargets(thickness_px=1)
-        parts = [
-            (element.label, line)
-            for element in elements(golden, tag)
-            for line in thick.lines(element, grid)
-        ]
+        thick = FormatPivotTargets()
+        parts = []  # class and points of each line
+        for element in elements(golden, tag):
+            for line in thick.lines(element, grid):
+                parts.append((element.label, line))
         labels = np.array([label for label, _ in parts])
         off = largest_difference(labels, data[f"{tag}_lines_kept_pivot_types"])
         yield Row(name, f"{tag}: classes of lines", off, 0)
-        pixels = [(line * (400, 200))[:, ::-1] for _, line in parts]
-        off = max(
-            largest_difference(p, data[f"{tag}_map_pivot_input{i}"]) for i, p in enumerate(pixels)
-        )
-        yield Row(name, f"{tag}: lines (pixels)", off, 1e-4)
-        pivots = [thick.points(line, label, grid) for label, line in parts]
-        for label in range(3):
-            own = [line for line, kind in zip(pivots, labels, strict=True) if kind == label]
+        offs = []
+        for i, (_, line) in enumerate(parts):
+            pixels = (line * (400, 200))[:, ::-1]
+            offs.append(largest_difference(pixels, data[f"{tag}_map_pivot_input{i}"]))
+        yield Row(name, f"{tag}: lines (pixels)", max(offs), 1e-4)
+        pivots = []
+        pivots_of_class: list[list[np.ndarray]] = [[], [], []]
+        for label, line in parts:
+            points = thick.points(line, label, grid)
+            pivots.append(points)
+            pivots_of_class[label].append(points)
+        for label, own in enumerate(pivots_of_class):
             numbers = [len(line) for line in own]
-            yield Row(
-                name,
-                f"{tag}: numbers of pivots {label}",
-                largest_difference(numbers, data[f"{tag}_lengths{label}"]),
-                0,
-            )
-            wanted = data[f"{tag}_pivots{label}"]
-            off = max(
-                (
-                    largest_difference(line, row[: len(line)])
-                    for line, row in zip(own, wanted, strict=True)
-                ),
-                default=0,
-            )
-            yield Row(name, f"{tag}: pivots {label}", off, 1e-9)
+            off = largest_difference(numbers, data[f"{tag}_lengths{label}"])
+            yield Row(name, f"{tag}: numbers of pivots {label}", off, 0)
+            offs = []
+            for line, row in zip(own, data[f"{tag}_pivots{label}"], strict=True):
+                offs.append(largest_difference(line, row[: len(line)]))
+            yield Row(name, f"{tag}: pivots {label}", max(offs, default=0), 1e-9)
         masks, _ = thick.masks(parts, pivots, (400, 200))
         drawn = np.zeros((3, 400, 200), int)
         for number, (mask, label) in enumerate(zip(masks, labels, strict=True)):
@@ -101,7 +94,8 @@ def check_pivots(golden: Golden, name: str) -> Iterator[Row]:
         # no loss reads the masks of width 1, and versions of OpenCV draw such lines differently
         lines, _ = FormatPivotTargets(thickness_px=1).masks(parts, pivots, (400, 200))
         thin = np.stack([lines[labels == label].any(0) for label in range(3)])
-        far = sum((a & ~wide(b)).sum() for a, b in permutations((thin, data[f"{tag}_mask1"] > 0)))
+        wanted = data[f"{tag}_mask1"] > 0
+        far = (thin & ~wide(wanted)).sum() + (wanted & ~wide(thin)).sum()
         yield Row(name, f"{tag}: pixels of width 1 that are more than one off", far, 0)
 
 
@@ -121,17 +115,20 @@ class Given:
     }
 
     def __init__(self, parts: PivotParts, head: PivotHead, tag: str, layers: Iterable[int]) -> None:
-        self.parts, self.tag = parts, tag
-        self.layers = [
-            [self.lines(f"{i}_{j}", n, p) for j, (n, p) in enumerate(head.decoder.queries)]
-            for i in layers
-        ]
+        self.parts = parts
+        self.tag = tag
+        self.layers: list[list[Lines]] = []
+        for i in layers:
+            classes = []
+            for j, (n, p) in enumerate(head.decoder.queries):
+                classes.append(self.lines(f"{i}_{j}", n, p))
+            self.layers.append(classes)
 
     def lines(self, number: str, n: int, p: int) -> Lines:
         """Return the lines of a layer and class."""
         parts = {}
         for ours, (theirs, shape) in self.SHAPES.items():
-            full = (1, n, *((p,) if "point" in ours else ()), *shape)
+            full = (1, n, p, *shape) if "point" in ours else (1, n, *shape)
             key = f"{self.tag}{theirs}{number}"
             if ours == "points":
                 seed = self.parts.golden.seed
@@ -156,21 +153,27 @@ LOSS_NAMES = {
 @check("pivotnet_losses_{variant}.npz")
 def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     """Compare matches, losses, gradients and what is decoded."""
-    data, parts = golden.read_arrays(name), PivotParts(golden)
+    data = golden.read_arrays(name)
+    parts = PivotParts(golden)
     head = parts.head()
     for tag in ("closed", "many", "dividers_only"):
         yield from loss_rows(parts, name, head, tag, data)
     (layer,) = Given(parts, head, "pv_post_", [5]).layers
-    output = pack_lines([Lines(*(part.detach() for part in own)) for own in layer])
+    detached = []
+    for lines in layer:
+        detached.append(Lines(*(part.detach() for part in lines)))
+    output = pack_lines(detached)
     yield from decoded_rows(name, head, output, data, "post", (100, 50))
 
 
 def truth_of(golden: Golden, tag: str) -> Det3DDataSample:
     """Return a sample with the targets of a set, with masks of every fourth pixel."""
-    only = tag == "dividers_only"
-    found = elements(golden, "many" if only else tag)
+    if tag == "dividers_only":
+        instances = [element for element in elements(golden, "many") if element.label == 0]
+    else:
+        instances = elements(golden, tag)
     results = {
-        "map_instances": [e for e in found if e.label == 0 or not only],
+        "map_instances": instances,
         "token": tag,
         "x_range": GRID.x_range,
         "y_range": GRID.y_range,
@@ -186,19 +189,22 @@ def loss_rows(
 ) -> Iterator[Row]:
     """Compare matches, losses and gradients with a set of ground truth."""
     given = Given(parts, head, "pv_loss_", range(6))
-    semantic = [
-        [parts.normal(f"pv_loss_sem{i}_{j}", (1, 2, 100, 50), shift=-1) for j in range(3)]
-        for i in range(4)
-    ]
-    for part in chain.from_iterable(semantic):
-        part.requires_grad_()
+    semantic = []  # logits of each level and class
+    class_masks = []
+    for i in range(4):
+        level = []
+        for j in range(3):
+            logits = parts.normal(f"pv_loss_sem{i}_{j}", (1, 2, 100, 50), shift=-1)
+            level.append(logits.requires_grad_())
+        semantic.append(level)
+        class_masks.append(torch.cat([logits[:, 1:] for logits in level], 1))
     truth = head.truth(truth_of(parts.golden, tag))
     nothing = torch.empty(0)
     outputs = [LinePredictions(nothing, nothing, lines) for lines in given.layers]
     losses, matches = head.line_losses(outputs, [truth], [tag])
-    class_masks = [torch.cat([part[:, 1:] for part in level], 1) for level in semantic]
     losses["semantic"] = head.semantic_loss(class_masks, [truth])
-    wrong, paths = 0.0, []
+    wrong = 0.0
+    paths = []
     for i, j in product(range(6), range(3)):
         (found,) = matches[3 * i + j]
         pairs = torch.stack([found.rows, found.cols], 1)
@@ -207,7 +213,9 @@ def loss_rows(
         paths += [np.flatnonzero(path) for path in found.is_pivot.numpy()]
     yield Row(name, f"{tag}: pairs of prediction and ground truth", wrong, 0)
     width = data[f"{tag}_pivot_matches"].shape[1]
-    filled = [np.pad(path, (0, width - len(path)), constant_values=-1) for path in paths]
+    filled = []
+    for path in paths:
+        filled.append(np.pad(path, (0, width - len(path)), constant_values=-1))
     off = largest_difference(np.stack(filled), data[f"{tag}_pivot_matches"])
     yield Row(name, f"{tag}: paths of pivots", off, 0)
     for ours, theirs in LOSS_NAMES.items():
@@ -217,7 +225,8 @@ def loss_rows(
     off = largest_relative(total.detach(), data[f"{tag}_total_loss"])
     yield Row(name, f"{tag}: total (relative)", off, 1e-4)
     total.backward()
-    for j in range(3 * (tag != "dividers_only")):
+    num_compared = 0 if tag == "dividers_only" else 3
+    for j in range(num_compared):
         lines = given.layers[5][j]
         gradients = {
             f"ctr_im_l5_c{j}": lines.points.grad,
