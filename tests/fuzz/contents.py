@@ -23,11 +23,13 @@ from minicity.repaint import Change, changes_geojson
 
 def info_v2(sample: MapSample) -> dict[str, Any]:
     """Return mmdet3d's info file of a sample."""
-    images = {
-        c.name: {"img_path": c.path, "cam2img": c.intrinsics.tolist(),
-                 "lidar2cam": c.cam_from_frame.tolist()}
-        for c in sample.cameras
-    }  # fmt: skip
+    images = {}
+    for camera in sample.cameras:
+        images[camera.name] = {
+            "img_path": camera.path,
+            "cam2img": camera.intrinsics.tolist(),
+            "lidar2cam": camera.cam_from_frame.tolist(),
+        }
     lidar = {"lidar2ego": sample.ego_from_frame.tolist(), "lidar_path": sample.lidar.path}
     pose = sample.global_from_frame @ np.linalg.inv(sample.ego_from_frame)
     entry = {"token": "t", "timestamp": 1.5, "images": images, "lidar_points": lidar,
@@ -49,17 +51,17 @@ def info_of_maptr(sample: MapSample) -> dict[str, Any]:
     lines: dict[str, list[Any]] = {name: [] for name in CLASSES}
     for instance in sample.instances:
         lines[CLASSES[instance.label]].append(instance.points.astype(float).tolist())
+    sweeps = [sensor(sweep.path, sweep.frame_from_lidar) for sweep in sample.lidar.sweeps]
+    cameras = {}
+    for camera in sample.cameras:
+        cameras[camera.name] = sensor(camera.path, np.linalg.inv(camera.cam_from_frame))
+        cameras[camera.name]["cam_intrinsic"] = camera.intrinsics.tolist()
     entry = {
         "token": "t", "timestamp": 7, "map_location": "town", "scene_token": "s",
         "lidar_path": sample.lidar.path, "can_bus": np.zeros(18), "annotation": lines,
         "lidar2ego_translation": [0.0, 0.0, 1.8], "lidar2ego_rotation": [1.0, 0.0, 0.0, 0.0],
         "ego2global_translation": [5.0, 6.0, 0.0], "ego2global_rotation": [1.0, 0.0, 0.0, 0.0],
-        "sweeps": [sensor(s.path, s.frame_from_lidar) for s in sample.lidar.sweeps],
-        "cams": {
-            c.name: sensor(c.path, np.linalg.inv(c.cam_from_frame))
-            | {"cam_intrinsic": c.intrinsics.tolist()}
-            for c in sample.cameras
-        },
+        "sweeps": sweeps, "cams": cameras,
     }  # fmt: skip
     return {"infos": [entry], "metadata": {"version": "x"}}
 
@@ -71,11 +73,14 @@ def info_of_argoverse2(sample: MapSample) -> dict[str, Any]:
     for instance in sample.instances:  # along x, as the range is
         points = instance.points[:, ::-1].astype(float).tolist()
         lines[CLASSES[instance.label]].append(points)
-    cameras = {
-        c.name: {"img_fpath": c.path, "intrinsics": c.intrinsics.tolist(),
-                 "extrinsics": c.cam_from_frame.tolist(), **turn}
-        for c in sample.cameras
-    }  # fmt: skip
+    cameras = {}
+    for camera in sample.cameras:
+        cameras[camera.name] = {
+            "img_fpath": camera.path,
+            "intrinsics": camera.intrinsics.tolist(),
+            "extrinsics": camera.cam_from_frame.tolist(),
+            **turn,
+        }
     entry = {"token": "t", "log_id": "l", "timestamp": 7, "lidar_path": sample.lidar.path,
              "cams": cameras, "annotation": lines, **turn}  # fmt: skip
     return {"samples": [entry]}
@@ -105,8 +110,10 @@ def exported_model() -> bytes:
         helper.make_node("Identity", ["classes"], ["labels"]),
     ]
     numbers = TensorProto.FLOAT
-    shapes = {"images": [2, 3, 4, 6], "img_from_frame": [2, 4, 4]}
-    inputs = [helper.make_tensor_value_info(n, numbers, shape) for n, shape in shapes.items()]
+    inputs = [
+        helper.make_tensor_value_info("images", numbers, [2, 3, 4, 6]),
+        helper.make_tensor_value_info("img_from_frame", numbers, [2, 4, 4]),
+    ]
     outputs = [
         helper.make_tensor_value_info("scores", numbers, [10]),
         helper.make_tensor_value_info("labels", TensorProto.INT64, [10]),
@@ -127,12 +134,15 @@ def exported_model() -> bytes:
 
 def own_calibration(sample: MapSample) -> dict[str, Any]:
     """Return a calibration file for the images of a sample."""
-    cameras = {
-        c.name: {"images": c.path, "intrinsics": c.intrinsics.tolist(),
-                 "vehicle_from_camera": np.linalg.inv(c.cam_from_frame).tolist()}
-        for c in sample.cameras
-    }  # fmt: skip
-    next(iter(cameras.values()))["distortion"] = [-0.2, 0.05, 0.0, 0.0]
+    cameras = {}
+    for camera in sample.cameras:
+        cameras[camera.name] = {
+            "images": camera.path,
+            "intrinsics": camera.intrinsics.tolist(),
+            "vehicle_from_camera": np.linalg.inv(camera.cam_from_frame).tolist(),
+        }
+    first = sample.cameras[0].name
+    cameras[first]["distortion"] = [-0.2, 0.05, 0.0, 0.0]
     return {"cameras": cameras, "ground_z_m": 0.1}
 
 
@@ -159,12 +169,20 @@ def changes(map_name: str) -> bytes:
 
 def own_record(sample: MapSample) -> dict[str, Any]:
     """Return a sample as a plain record."""
-    cameras = [
-        {"name": c.name, "path": c.path, "width": c.width, "height": c.height,
-         "intrinsics": c.intrinsics.tolist(), "cam_from_frame": c.cam_from_frame.tolist()}
-        for c in sample.cameras
-    ]  # fmt: skip
-    lines = [{"label": i.label, "points": i.points.tolist()} for i in sample.instances]
+    cameras = []
+    for camera in sample.cameras:
+        record = {
+            "name": camera.name,
+            "path": camera.path,
+            "width": camera.width,
+            "height": camera.height,
+            "intrinsics": camera.intrinsics.tolist(),
+            "cam_from_frame": camera.cam_from_frame.tolist(),
+        }
+        cameras.append(record)
+    lines = []
+    for instance in sample.instances:
+        lines.append({"label": instance.label, "points": instance.points.tolist()})
     return {"token": "t", "cameras": cameras, "instances": lines, "timestamp_ns": 5}
 
 
@@ -176,7 +194,8 @@ def write_shards(
     results = [(token, vectors_of(elements, meta.classes)) for token in "ab"]
     settings = MetricSettings(meta.classes, grid=BEVGrid(meta.x_range, meta.y_range))
     evaluator = MapEvaluator.from_names(["chamfer", "raster", "pld"], settings)
-    for shard in (Shard(index, count) for index in range(count)):
+    for index in range(count):
+        shard = Shard(index, count)
         own = replace(sample, token=str(shard.index))
         if kind == ANNOTATIONS:
             write_annotations(target, meta, [own], shard)
