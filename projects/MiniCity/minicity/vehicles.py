@@ -1,6 +1,6 @@
 """Vehicles and people, and their meshes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -128,36 +128,53 @@ def vehicle_mesh(vehicles: list[Vehicle]) -> FrozenMesh:
     """Mesh of vehicles and people in the world, with one object for each, in their order."""
     if not vehicles:
         return Mesh().freeze()
-    # Meshes at the origin, which are shared through a cache. They are copied and not changed here.
-    templates = [_template(v.category, v.size, color=v.color) for v in vehicles]
-    objects = np.arange(len(templates))  # index of each object
-    quad_groups = np.repeat(objects, [len(t.quads) for t in templates])  # object of each quad
-    disc_groups = np.repeat(objects, [len(t.discs) for t in templates])  # object of each disc
-    yaw = np.array([v.yaw_rad for v in vehicles])
-    turn = np.zeros((len(vehicles), 3, 3))  # rotations about z
-    turn[:, 0, 0] = np.cos(yaw)
-    turn[:, 0, 1] = -np.sin(yaw)
-    turn[:, 1, 0] = np.sin(yaw)
-    turn[:, 1, 1] = np.cos(yaw)
-    turn[:, 2, 2] = 1.0
-    centers = np.array([v.center for v in vehicles])
-    half_heights = np.array([[0.0, 0.0, v.size[2] / 2] for v in vehicles])
-    floor = centers - half_heights  # centres of the bottoms
-    quads = np.concatenate([t.quads for t in templates])
-    discs = np.concatenate([t.discs for t in templates])
-    discs[:, :3] += floor[disc_groups]  # no rotation: the disc of a head lies on the vertical axis
+    templates = []  # meshes at the origin, which are shared through a cache and not changed here
+    yaws = []
+    centers = []
+    half_heights = []
+    for vehicle in vehicles:
+        templates.append(_template(vehicle.category, vehicle.size, color=vehicle.color))
+        yaws.append(vehicle.yaw_rad)
+        centers.append(vehicle.center)
+        half_heights.append([0.0, 0.0, vehicle.size[2] / 2])
+    anchors = np.array(centers)
+    floor = anchors - np.array(half_heights)  # centres of the bottoms
+    local = _concatenate(templates)
+    discs = local.discs.copy()
+    # No rotation: the disc of a head lies on the vertical axis.
+    discs[:, :3] += floor[local.disc_groups]
     # Each of the four corners k of a quad f is rotated by the matrix of the quad's vehicle.
-    turned_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads)  # (F, 4, 3)
-    world_quads = turned_quads + floor[quad_groups][:, None]
+    turn = _rotations(np.array(yaws))[local.groups]
+    turned_quads = np.einsum("fij,fkj->fki", turn, local.quads)  # (F, 4, 3)
+    quads = turned_quads + floor[local.groups][:, None]
+    return replace(local, quads=quads, discs=discs, anchors=anchors)
+
+
+def _rotations(yaws: Array) -> Array:
+    """Rotation matrices about z, by angles in radians. (N,) -> (N, 3, 3)"""
+    turn = np.zeros((len(yaws), 3, 3))
+    turn[:, 0, 0] = np.cos(yaws)
+    turn[:, 0, 1] = -np.sin(yaws)
+    turn[:, 1, 0] = np.sin(yaws)
+    turn[:, 1, 1] = np.cos(yaws)
+    turn[:, 2, 2] = 1.0
+    return turn
+
+
+def _concatenate(meshes: list[FrozenMesh]) -> FrozenMesh:
+    """Concatenate meshes of one object each, in new arrays."""
+    objects = np.arange(len(meshes))  # index of each object
+    num_quads = [len(mesh.quads) for mesh in meshes]
+    num_discs = [len(mesh.discs) for mesh in meshes]
     return FrozenMesh(
-        quads=world_quads,
-        colors=np.concatenate([t.colors for t in templates]),
-        groups=quad_groups,
-        layers=np.concatenate([t.layers for t in templates]),
-        glow=np.concatenate([t.glow for t in templates]),
-        discs=discs,
-        disc_colors=np.concatenate([t.disc_colors for t in templates]),
-        disc_groups=disc_groups,
-        anchors=centers,
-        backdrop=np.zeros(len(vehicles), dtype=bool),  # no object is a building
+        quads=np.concatenate([mesh.quads for mesh in meshes]),
+        colors=np.concatenate([mesh.colors for mesh in meshes]),
+        groups=np.repeat(objects, num_quads),
+        layers=np.concatenate([mesh.layers for mesh in meshes]),
+        glow=np.concatenate([mesh.glow for mesh in meshes]),
+        discs=np.concatenate([mesh.discs for mesh in meshes]),
+        disc_colors=np.concatenate([mesh.disc_colors for mesh in meshes]),
+        disc_groups=np.repeat(objects, num_discs),
+        anchors=np.concatenate([mesh.anchors for mesh in meshes]),
+        backdrop=np.concatenate([mesh.backdrop for mesh in meshes]),
     )
