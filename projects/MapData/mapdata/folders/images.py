@@ -188,7 +188,8 @@ def _find_images(
             f"{hint if suffixes else ''}"
         )
     # Names without suffix identify the images of one time in all cameras.
-    if len({path.stem for path in images}) < len(images):
+    stems = {path.stem for path in images}
+    if len(stems) < len(images):
         raise InputError(
             f"two of its images at {place} have equal names (apart from folder and suffix): rename "
             "one"
@@ -239,14 +240,16 @@ def _group_images(
         return _group_by_times(
             images, rate_hz, tolerance_ns=tolerance_ns, time_of=time_of, folder=folder
         )
-    if all(len(paths) == 1 for paths in images.values()):
+    has_single_images = all(len(paths) == 1 for paths in images.values())
+    if has_single_images:
         single_images = {}
         time_of = {}
         for name, paths in images.items():
             path = paths[0]
             single_images[name] = (path.relative_to(folder).as_posix(), 0)  # at time 0
             time_of[path.stem] = 0
-        return [RigFrame(token=f"{scene}_0", time_ns=0, images=single_images)], time_of, []
+        frame = RigFrame(token=f"{scene}_0", time_ns=0, images=single_images)
+        return [frame], time_of, []
 
     # Images with equal names form a frame. Frames follow each other in the order of the first
     # camera's images, at a fixed rate.
@@ -289,9 +292,13 @@ def _group_by_times(
     path_at: dict[str, dict[int, str]] = {}  # path of the image of a camera at a time
     times_ns = {}
     for name, paths in images.items():
-        path_at[name] = {time_of[path.stem]: path.relative_to(folder).as_posix() for path in paths}
-        times_ns[name] = np.array(sorted(path_at[name]), dtype=np.int64)
-    frame_times = next(iter(times_ns.values())).tolist()
+        camera_paths = {}
+        for path in paths:
+            camera_paths[time_of[path.stem]] = path.relative_to(folder).as_posix()
+        path_at[name] = camera_paths
+        times_ns[name] = np.array(sorted(camera_paths), dtype=np.int64)
+    first_camera = next(iter(times_ns))
+    frame_times = times_ns[first_camera].tolist()
     _check_rate(frame_times, rate_hz=rate_hz)
     frames = []
     # For each frame, the time of the nearest image of each camera with an image in the tolerance.
@@ -325,7 +332,9 @@ def _usage_notes(
     """Notes on cameras with unused images, or without an image in some samples."""
     first = next(iter(images))
     counts: Counter[str] = Counter()  # samples with an image of the camera
-    used: dict[str, set[str]] = {name: set() for name in images}  # an image may be in two samples
+    used: dict[str, set[str]] = {}  # paths by camera; an image may be in two samples
+    for name in images:
+        used[name] = set()
     for frame in frames:
         counts.update(frame.images.keys())
         for name, (path, _) in frame.images.items():
@@ -356,10 +365,9 @@ def _frames_with_poses(
     missing = len(frames) - len(selected)
     if not missing:
         return selected, []
-    spans = (
-        f"images are from {span_of([frame.time_ns for frame in frames])}, poses from "
-        f"{span_of(poses.times_ns.tolist())}"
-    )
+    image_times = [frame.time_ns for frame in frames]
+    pose_times = poses.times_ns.tolist()
+    spans = f"images are from {span_of(image_times)}, poses from {span_of(pose_times)}"
     if not selected:
         raise InputError(f"no image has a pose near its time: {spans}")
     note = (
