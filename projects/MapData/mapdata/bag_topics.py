@@ -149,7 +149,8 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
     # A camera info belongs to one camera: to the one whose topic has the same words, or else to the
     # only one that it may belong to. Other cameras that could have it are left out.
     for info, names in claims.items():
-        matching_names = [name for name in names if _words(cameras[name]) == _words(info)]
+        info_words = _words(info)
+        matching_names = [name for name in names if _words(cameras[name]) == info_words]
         # A camera info in the root namespace could belong to any camera. Without equal words, it is
         # accepted only if no camera has another camera info.
         is_in_root = info.count("/") == 1
@@ -166,7 +167,8 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
 
 def _words(topic: str) -> list[str]:
     """Sorted words of a topic that distinguish cameras."""
-    return sorted(word for word in re.split(r"[/_]", topic.lower()) if word not in _COMMON_WORDS)
+    all_words = re.split(r"[/_]", topic.lower())
+    return sorted(word for word in all_words if word not in _COMMON_WORDS)
 
 
 def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:
