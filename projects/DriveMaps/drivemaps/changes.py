@@ -102,14 +102,7 @@ def find_changes(
                 changes.append(change)
     # By class, then by kind (removed, added, moved), then the most certain change first.
     changes.sort(key=lambda change: (change.label, KINDS.index(change.kind), -change.confidence))
-    num_on_new_ground: Counter[str] = Counter()
-    for one_pass in passes:
-        elements = one_pass.elements
-        points, owners = _sample(elements)
-        # Known ground is within 30 m of an element of the old map.
-        is_known = np.zeros(len(elements), dtype=np.bool_)
-        is_known[owners[on_known_ground(points, old)]] = True
-        num_on_new_ground.update(classes[label] for label in elements.labels[~is_known])
+    num_on_new_ground = _count_on_new_ground(old, passes, classes)
     # Elements of the old map that are far from the passes are not in view.
     is_in_view = np.zeros(len(whole_map), dtype=np.bool_)
     is_in_view[is_near] = _are_in_view(old, passes)
@@ -125,6 +118,22 @@ def find_changes(
         num_not_in_view=dict(num_not_in_view),
         num_too_small=dict(num_too_small),
     )
+
+
+def _count_on_new_ground(
+    old: MapElements, passes: Sequence[Pass], classes: Sequence[str]
+) -> Counter[str]:
+    """Count the elements of the passes, by class, that lie far from all elements of the old map."""
+    counts: Counter[str] = Counter()
+    for one_pass in passes:
+        elements = one_pass.elements
+        points, owners = _sample(elements)
+        # Known ground is within 30 m of an element of the old map.
+        is_known = np.zeros(len(elements), dtype=np.bool_)
+        is_known[owners[on_known_ground(points, old)]] = True
+        for label in elements.labels[~is_known]:
+            counts[classes[label]] += 1
+    return counts
 
 
 def _sample(elements: MapElements) -> tuple[FloatArray, IntArray]:
@@ -248,7 +257,12 @@ def summarize_changes(found: Changes) -> str:
         (found.num_not_in_view, "of the old map not in view"),
         (found.num_too_small, "of the old map below 1 m2"),
     ):
-        if count_by_class:
-            numbers = ", ".join(f"{count} {name}" for name, count in sorted(count_by_class.items()))
-            not_compared.append(f"{numbers} {reason}")
-    return f"{text} (not compared: {'; '.join(not_compared)})" if not_compared else text
+        if not count_by_class:
+            continue
+        numbers = []
+        for name, count in sorted(count_by_class.items()):
+            numbers.append(f"{count} {name}")
+        not_compared.append(f"{', '.join(numbers)} {reason}")
+    if not_compared:
+        text += f" (not compared: {'; '.join(not_compared)})"
+    return text

@@ -89,8 +89,12 @@ def polygons_of(rings: Sequence[FloatArray]) -> list[shapely.Geometry]:
 
 def _unite_areas(rings: Sequence[FloatArray]) -> list[FloatArray]:
     """Outer rings of the union of areas. each (n, 2)"""
-    parts = shapely.get_parts(shapely.union_all(polygons_of(rings), grid_size=GRID_M))
-    return [shapely.get_coordinates(p.exterior) for p in parts if p.area >= MIN_AREA_M2]
+    union = shapely.union_all(polygons_of(rings), grid_size=GRID_M)
+    outer_rings = []
+    for part in shapely.get_parts(union):
+        if part.area >= MIN_AREA_M2:
+            outer_rings.append(shapely.get_coordinates(part.exterior))
+    return outer_rings
 
 
 def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
@@ -114,4 +118,8 @@ def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
     # lines of different groups, across gaps of up to 2 m, and straight on at forks.
     stitched = stitch([shapely.get_coordinates(part) for part in parts])
     # Short lines are dropped only now, as a part between two forks may be short before stitching.
-    return [line for line in stitched if shapely.LineString(line).length >= MIN_LENGTH_M]
+    long_lines = []
+    for line in stitched:
+        if shapely.LineString(line).length >= MIN_LENGTH_M:
+            long_lines.append(line)
+    return long_lines
