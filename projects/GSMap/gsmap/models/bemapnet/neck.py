@@ -62,7 +62,9 @@ class FusionConv(nn.Module):
         weights = self.weights.relu()
         shares = weights / (weights.sum() + 1e-4)  # no division by 0 if all weights are negative
         mean = sum(share * feats for share, feats in zip(shares, maps, strict=True))
-        return self.norm(self.pointwise(self.depthwise(F.silu(mean))))
+        fused = self.depthwise(F.silu(mean))
+        fused = self.pointwise(fused)
+        return self.norm(fused)
 
 
 class BiFPNRound(nn.Module):
@@ -142,7 +144,9 @@ class BiFPN(BaseModule):
         # The image features are P3 to P5; P6 and P7 are computed from P5.
         sixth = downsample(self.coarser(feats[-1]))
         seventh = downsample(sixth)
-        levels = [conv(level) for conv, level in zip(self.inputs, feats, strict=True)]
+        levels = []
+        for conv, level in zip(self.inputs, feats, strict=True):
+            levels.append(conv(level))
         back_levels = [levels[0]]  # not used: `BiFPNRound` ignores the finest entry
         for conv, level in zip(self.again, feats[1:], strict=True):
             back_levels.append(conv(level))
