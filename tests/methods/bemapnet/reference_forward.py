@@ -37,35 +37,40 @@ def released_model(parts: BezierParts) -> nn.Module:
 @torch.no_grad()
 def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     """Compare the way from images to the lines."""
-    data, parts = golden.read_arrays(name), BezierParts(golden)
+    data = golden.read_arrays(name)
+    parts = BezierParts(golden)
     model = released_model(parts)
+    head = model.map_head
     images = torch.from_numpy(parts.recipe.images(*IMAGE_SIZE, 6, golden.seed))
-    encoder, head, feats = model.bev_encoder, model.map_head, model.img_backbone(images)
+    feats = model.img_backbone(images)
     (neck,) = model.img_neck(feats)
-    bev = encoder.encode(neck[None], {"ground_from_img": ground_matrices(golden, IMAGE)}, FRAME)
+    calibration = {"ground_from_img": ground_matrices(golden, IMAGE)}
+    bev = model.bev_encoder.encode(neck[None], calibration, FRAME)
     front = torch.cat([head.front(level) for level in bev["bev_levels"]])
     states = head.decoder(front[-1:])[1:]
     semantic = head.class_masks(bev["bev_feats"])[0]
+    lines_of_layers = [lines for (lines,) in states]  # of all classes together
+    last_lines = [lines_of_layers[i] for i in ENDS]
     subsets = {
         "bkb3": (feats[2][:, ::128], 5e-4),
         "neck_sub": (neck[:, ::40], 5e-4),
         "bev_sub": (front[:, ::64, ::8, ::4], 1e-4),
-        "obj": (torch.cat([own.logits for (own,) in states]), LOGITS),
-        "dec_sub": (torch.cat([own.states[:, ::5, 0, ::8] for (own,) in states]), LOGITS),
-        "masks_sub": (
-            torch.cat([states[i][0].masks[:, ::10, ::10, ::5] for i in ENDS]),
-            LOGITS,
-        ),
+        "obj": (torch.cat([lines.logits for lines in lines_of_layers]), LOGITS),
+        "dec_sub": (torch.cat([lines.states for lines in lines_of_layers])[:, ::5, 0, ::8], LOGITS),
+        "masks_sub": (torch.cat([lines.masks for lines in last_lines])[:, ::10, ::10, ::5], LOGITS),
     }
     for key, (value, tolerance) in subsets.items():
         yield Row(name, key, largest_difference(value, data[key]), tolerance)
     mean = head.coordinate_feature()
-    by_class = [states[i][0].states[:, :, 0].split(list(head.queries), 1) for i in ENDS]
+    states_by_class = []  # for each layer, the states of each class
+    for lines in last_lines:
+        states_by_class.append(lines.states[:, :, 0].split(list(head.queries), 1))
     last = head.predictions(states[-1], mean)
     for label, lines in enumerate(last.lines):
-        raw = [head.curve_logits(label, own[label], mean) for own in by_class]
-        for key, values in zip(KEYS, zip(*raw, strict=True), strict=True):
-            off = largest_difference(torch.cat(values), data[f"{key}{label}"])
+        raw = [head.curve_logits(label, own[label], mean) for own in states_by_class]
+        for index, key in enumerate(KEYS):
+            value = torch.cat([logits[index] for logits in raw])
+            off = largest_difference(value, data[f"{key}{label}"])
             yield Row(name, f"{key}{label}", off, LOGITS)
         ours = {
             "ctr": (lines.controls[0], CURVES),
@@ -96,6 +101,7 @@ def kept_rows(
     found = np.stack([masks[labels == label].any(0) for label in range(3)])
     wanted = np.unpackbits(data["drawn"]).reshape(found.shape).astype(bool)
     # versions of OpenCV draw lines of one pixel differently
-    near = [binary_dilation(part, np.ones((1, 3, 3))) for part in (found, wanted)]
-    far = sum((a & ~b).sum() for a, b in zip((found, wanted), reversed(near), strict=True))
+    near_found = binary_dilation(found, np.ones((1, 3, 3)))
+    near_wanted = binary_dilation(wanted, np.ones((1, 3, 3)))
+    far = (found & ~near_wanted).sum() + (wanted & ~near_found).sum()
     yield Row(name, "drawn pixels that are more than one off", far, 0)
