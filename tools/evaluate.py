@@ -99,7 +99,8 @@ def json_settings(path: Path) -> TruthSettings:
     # Errors about the content begin with the first text and end with the second one.
     with explain_errors(f"meta of {path}", "correct it, or remove it"):
         classes = meta.get("classes", CLASSES)
-        if not isinstance(classes, (list, tuple)) or not all(isinstance(c, str) for c in classes):
+        is_list = isinstance(classes, (list, tuple))
+        if not is_list or not all(isinstance(name, str) for name in classes):
             raise InputError(f"classes must be a list of names, got {classes!r:.80}")
         low_x, high_x = meta.get("x_range", x_range)
         low_y, high_y = meta.get("y_range", y_range)
@@ -265,8 +266,12 @@ def print_reports(reports: list[MetricReport], notes: list[str], args: argparse.
         from gsmap.visualization.plots import plot_result
 
         # Metrics with an AP per sample have no curve over all samples.
-        with_curves = [report for report in reports if report.detections and not report.sample_aps]
-        print(f"curves: {save_figure(plot_result(with_curves), args.pr_curves)}")
+        with_curves = []
+        for report in reports:
+            if report.detections and not report.sample_aps:
+                with_curves.append(report)
+        path = save_figure(plot_result(with_curves), args.pr_curves)
+        print(f"curves: {path}")
 
 
 def main(argv: list[str] | None = None) -> str:
