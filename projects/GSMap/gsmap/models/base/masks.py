@@ -136,8 +136,8 @@ class ElementMasks:
                     "FormatMapTargets."
                 )
         length = max(sample.polylines.shape[1] for sample in gt_instances)
-        polylines = torch.cat([_pad_lines(sample.polylines, length) for sample in gt_instances])
-        return self.draw(polylines, labels, grid)
+        padded = [_pad_lines(sample.polylines, length) for sample in gt_instances]
+        return self.draw(torch.cat(padded), labels, grid)
 
 
 def _pad_lines(lines: Tensor, length: int) -> Tensor:
