@@ -61,8 +61,10 @@ def triton_kernels(switch: str) -> set[str]:
             f"{SWITCH} names {sorted(unknown)}, which are no Triton kernels: choose from "
             f"{sorted(TRITON_KERNELS)}, or 'all'."
         )
-    trusted = {name for name, is_trusted in TRITON_KERNELS.items() if is_trusted}
-    return names | trusted
+    for name, is_trusted in TRITON_KERNELS.items():
+        if is_trusted:
+            names.add(name)
+    return names
 
 
 AUTO_KERNELS = triton_kernels(os.environ.get(SWITCH, ""))

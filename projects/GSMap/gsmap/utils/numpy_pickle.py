@@ -91,9 +91,11 @@ class CheckedArray(np.ndarray):
             raise pickle.UnpicklingError(f"an array {shape} of {dtype} has {len(data)} bytes")
         # Booleans above 1, and characters beyond Unicode, are not valid. The bytes are checked as
         # integers.
-        order = ">" if dtype.byteorder == ">" else "<"
-        # None for other kinds of dtypes, which may have any bytes.
-        integer_dtype = {"b": "u1", "U": f"{order}u4"}.get(dtype.kind)
+        integer_dtype = None  # for other kinds of dtypes, which may have any bytes
+        if dtype.kind == "b":
+            integer_dtype = "u1"
+        elif dtype.kind == "U":
+            integer_dtype = ">u4" if dtype.byteorder == ">" else "<u4"
         if integer_dtype and data:
             integers = np.frombuffer(data, dtype=integer_dtype)
             if integers.max() > _MAX_INTEGER[dtype.kind]:
