@@ -202,12 +202,20 @@ class HDMapNetHead(DetectionHead):
         )
         lines = [line for line in traced_lines if len(line.pixels) > 1]  # one point is no line
         lines.sort(key=lambda line: -line.score)
-        # The centre of pixel (column, row) is at (column + 0.5, row + 0.5).
-        pts = pad_lines([metres_from_pixels(line.pixels + 0.5, self.grid) for line in lines])
+        scores = []
+        labels = []
+        lengths = []
+        polylines = []
+        for line in lines:
+            scores.append(line.score)
+            labels.append(line.label)
+            lengths.append(len(line.pixels))
+            # The centre of pixel (column, row) is at (column + 0.5, row + 0.5).
+            polylines.append(metres_from_pixels(line.pixels + 0.5, self.grid))
         instances = InstanceData(
-            scores_3d=torch.tensor([line.score for line in lines]),
-            labels_3d=torch.tensor([line.label for line in lines], dtype=torch.long),
-            pts=torch.from_numpy(pts).float(),
-            num_pts=torch.tensor([len(line.pixels) for line in lines], dtype=torch.long),
+            scores_3d=torch.tensor(scores),
+            labels_3d=torch.tensor(labels, dtype=torch.long),
+            pts=torch.from_numpy(pad_lines(polylines)).float(),
+            num_pts=torch.tensor(lengths, dtype=torch.long),
         )
         return instances.to(maps.semantic.device)
