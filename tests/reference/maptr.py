@@ -1,7 +1,7 @@
 """MapTR: state, forward pass, targets, assignment, losses and gradients."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,11 @@ SAMPLES = {
 }
 
 
+def keys_and_shapes(state: Mapping[str, torch.Tensor]) -> set[tuple[str, tuple[int, ...]]]:
+    """Return the keys of a state with the shapes of their tensors."""
+    return {(key, tuple(value.shape)) for key, value in state.items()}
+
+
 def state_rows(golden: Golden, name: str, config: str, shared: str = "-") -> Iterator[Row]:
     """Compare keys, shapes, counts and the round trip of an upstream state list with a model.
 
@@ -43,12 +48,14 @@ def state_rows(golden: Golden, name: str, config: str, shared: str = "-") -> Ite
     model = golden.model(config, name)
     shapes = golden.state_shapes(name)
     renamed = ours_from_upstream({key: torch.empty(shape) for key, shape in shapes.items()})
-    own = {key: tuple(value.shape) for key, value in model.state_dict().items()}
-    wrong = set(own.items()) ^ {(key, tuple(value.shape)) for key, value in renamed.items()}
+    wrong = keys_and_shapes(model.state_dict()) ^ keys_and_shapes(renamed)
     yield Row(name, "keys or shapes that differ", len(wrong), 0)
     key_map = find_key_map(shapes)
-    trainable = sum(p.numel() for p in model.parameters() if p.requires_grad)
-    twice = {name for name, _ in listed.get("shared_storage", [])}
+    trainable = 0
+    for parameter in model.parameters():
+        if parameter.requires_grad:
+            trainable += parameter.numel()
+    twice = {other_name for other_name, _ in listed.get("shared_storage", [])}
     twice |= {key for key in shapes if key.startswith(shared)}
     unused = {key for key in shapes if key_map.is_unused(key)}
     for key in unused - twice:  # upstream trains them too, without effect
@@ -58,12 +65,17 @@ def state_rows(golden: Golden, name: str, config: str, shared: str = "-") -> Ite
     back = upstream_from_ours(model.state_dict())
     # what only some models have, or the config says, is not written
     kept = {key for key, value in key_map.unused.items() if value is not None}
-    wanted = {k: v for k, v in shapes.items() if k in kept or k not in unused}
-    lost = set(wanted.items()) ^ {(key, tuple(value.shape)) for key, value in back.items()}
+    wanted = set()
+    for key, shape in shapes.items():
+        if key in kept or key not in unused:
+            wanted.add((key, shape))
+    lost = wanted ^ keys_and_shapes(back)
     yield Row(name, "keys lost on the way back", len(lost), 0)
-    original = {k: v for k, v in golden.upstream_state(name).items() if k not in unused}
-    changed = max(largest_difference(back[key], value) for key, value in original.items())
-    yield Row(name, "weights on the way back", changed, 0)
+    changes = []
+    for key, value in golden.upstream_state(name).items():
+        if key not in unused:
+            changes.append(largest_difference(back[key], value))
+    yield Row(name, "weights on the way back", max(changes), 0)
 
 
 @check(STATE)
@@ -100,8 +112,10 @@ def head_rows(
     pts_atol: float,
 ) -> Iterator[Row]:
     """Compare class scores, points and their boxes of all layers."""
-    scores, pts = stacked(outputs).scores, stacked(outputs).pts
-    low, high = pts.amin(-2), pts.amax(-2)
+    scores = stacked(outputs).scores
+    pts = stacked(outputs).pts
+    low = pts.amin(-2)
+    high = pts.amax(-2)
     boxes = torch.cat([(low + high) / 2, high - low], -1)
     yield Row(name, "all_cls_scores", largest_difference(scores, data["all_cls_scores"]), cls_atol)
     yield Row(name, "all_pts_preds", largest_difference(pts, data["all_pts_preds"]), pts_atol)
@@ -112,7 +126,8 @@ def decoded_rows(
     name: str, data: dict[str, np.ndarray], result: InstanceData, score_atol: float = 5e-4
 ) -> Iterator[Row]:
     """Compare decoded detections, paired by class and points, as scores may tie."""
-    labels, pts = result.labels_3d.numpy(), result.pts.numpy()
+    labels = result.labels_3d.numpy()
+    pts = result.pts.numpy()
     if pts.shape != data["dec_pts"].shape:
         yield Row(name, "number of detections", abs(len(pts) - len(data["dec_pts"])), 0)
         return
@@ -140,7 +155,8 @@ def bev_rows(
     """
     off = np.abs(bev.mean(0).numpy() - data["bev_embed_channel_mean"]) > atol * _MEAN_SHARE
     yield Row(name, "fraction of BEV cells that differ", float(off.mean()), fraction)
-    rows, cols = data["bev_rows"], data["bev_cols"]
+    rows = data["bev_rows"]
+    cols = data["bev_cols"]
     subset = bev.numpy()[:, rows][:, :, cols].reshape(len(bev), -1).T  # (cells, C)
     same = ~off[rows][:, cols].ravel()
     deviation = largest_difference(subset[same], data["bev_embed_sub"][same])
@@ -153,7 +169,8 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     """Compare the way from the images to the detections."""
     data = golden.read_arrays(name)
     size = name.split("_")[3]
-    model, meta = golden.model(CONFIG, STATE), golden.meta(size)
+    model = golden.model(CONFIG, STATE)
+    meta = golden.meta(size)
     feats = model.extract_img_feats(golden.images(size))
     yield Row(name, "FPN", largest_difference(feats[0][0, :, ::16], data["fpn_feat_sub"]), 1e-4)
     matrices = torch.as_tensor(meta["lidar2img"], dtype=torch.float32)[None]
@@ -166,14 +183,19 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     yield from bev_rows(name, data, bev_outputs["bev_feats"][0], 1e-4, 1e-3)
     head = model.map_head
     reference = head.reference.start(head.queries()[0])
-    yield Row(
-        name, "init_reference", largest_difference(reference[None], data["init_reference"]), 1e-5
-    )
+    off = largest_difference(reference[None], data["init_reference"])
+    yield Row(name, "init_reference", off, 1e-5)
     outputs = head(bev_outputs)
     states = stacked(outputs).point_states.flatten(2, 3)[:, 0, ::25, ::8]
     yield Row(name, "decoder states", largest_difference(states, data["hs_sub"]), 1e-3)
     yield from head_rows(name, data, outputs, 5e-4, 1e-4)
     yield from decoded_rows(name, data, head.predict_by_feat(outputs, [meta])[0])
+
+
+def loss_prefixes(num_layers: int) -> list[str]:
+    """Return the prefix of the losses of each layer; the last layer has none."""
+    prefixes = [f"d{layer}." for layer in range(num_layers - 1)]
+    return [*prefixes, ""]
 
 
 def loss_rows(
@@ -199,22 +221,23 @@ def loss_rows(
     Yields:
         The compared quantities.
     """
-    saved = [
-        golden.read_arrays(forward_file.format(size=size, variant=golden.variant))
-        for size, _ in samples
-    ]
-    scores, pts = (
-        torch.from_numpy(np.concatenate([arrays[key] for arrays in saved], 1)).requires_grad_()
-        for key in ("all_cls_scores", "all_pts_preds")
-    )
+    saved_scores = []
+    saved_pts = []
+    batch_gt = []
+    metas = []
+    for size, gt_set in samples:
+        saved = golden.read_arrays(forward_file.format(size=size, variant=golden.variant))
+        saved_scores.append(saved["all_cls_scores"])
+        saved_pts.append(saved["all_pts_preds"])
+        batch_gt.append(gt_instances(golden.gt_sets[gt_set]))
+        metas.append(golden.meta(size))
+    scores = torch.from_numpy(np.concatenate(saved_scores, 1)).requires_grad_()
+    pts = torch.from_numpy(np.concatenate(saved_pts, 1)).requires_grad_()
     outputs = predicted(head, scores, pts)
-    batch_gt = [gt_instances(golden.gt_sets[gt_set]) for _, gt_set in samples]
-    metas = [golden.meta(size) for size, _ in samples]
     yield from match_rows(name, data, head, outputs, batch_gt, metas)
     losses = head.loss_by_feat(outputs, batch_gt, metas)
-    layers = [*(f"d{layer}." for layer in range(len(scores) - 1)), ""]
     for key in names:
-        ours = [losses[layer + key].item() for layer in layers]
+        ours = [losses[layer + key].item() for layer in loss_prefixes(len(scores))]
         yield Row(name, f"{key} (relative)", largest_relative(ours, data[key]), 1e-4)
     # without ground truth nothing reaches the points
     torch.stack(list(losses.values())).sum().backward()
@@ -238,15 +261,17 @@ def head_loss_rows(
     Yields:
         The compared quantities.
     """
-    data, saved = golden.read_arrays(name), golden.read_arrays(forward_file)
-    scores, pts = (torch.from_numpy(saved[key]) for key in ("all_cls_scores", "all_pts_preds"))
+    data = golden.read_arrays(name)
+    saved = golden.read_arrays(forward_file)
+    scores = torch.from_numpy(saved["all_cls_scores"])
+    pts = torch.from_numpy(saved["all_pts_preds"])
     outputs = predicted(head, scores, pts)
     batch_gt = [gt_instances(golden.gt_sets[name.split("_")[2]])]
     metas = [golden.meta("reduced")]
     matches = {f"{key}_b0": value for key, value in data.items() if key.startswith("match_")}
     yield from match_rows(name, matches, head, outputs, batch_gt, metas)
     losses = head.loss_by_feat(outputs, batch_gt, metas)
-    layers = [*(f"d{layer}." for layer in range(len(scores) - 1)), ""]
+    layers = loss_prefixes(len(scores))
     for theirs, ours in renamed.items():
         values = [losses[layer + ours].item() for layer in layers]
         wanted = [data[f"loss/{layer}{theirs}"] for layer in layers]
@@ -317,8 +342,10 @@ def check_many_orders(golden: Golden, name: str) -> Iterator[Row]:
     gt = gt_instances(golden.gt_sets["bigring"])
     yield Row(name, "gt_fixed_pts (m)", largest_difference(gt.pts, data["gt_fixed_pts"]), 1e-4)
     yield Row(name, "bbox (m)", largest_difference(gt.boxes, data["bbox"]), 1e-4)
-    rolled = [np.roll(ring[:-1], k, 0) for k in range(len(ring) - 1)]
-    rings = [{"label": 2, "pts": np.concatenate([points, points[:1]])} for points in rolled]
+    rings = []
+    for k in range(len(ring) - 1):
+        points = np.roll(ring[:-1], k, 0)
+        rings.append({"label": 2, "pts": np.concatenate([points, points[:1]])})
     every = gt_instances(rings).pts.numpy()
     distance = np.abs(data["gt_shift_pts_seed0"][0][:, None] - every).max((-1, -2))
     yield Row(name, "drawn orders are orders of the ring (m)", float(distance.min(1).max()), 1e-4)
