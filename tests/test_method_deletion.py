@@ -22,7 +22,8 @@ REPO = Path(__file__).resolve().parents[1]
 MODELS = Path("projects/GSMap/gsmap/models")
 COMBINATIONS = Path("projects/GSMap/configs")
 PACKAGES = ("GSMap", "MapData", "DriveMaps", "MiniCity")
-STAYS = {"gsmap", *next(method.built_on for method in METHODS if method.name == "gsmap")}
+BUILT_ON = {method.name: method.built_on for method in METHODS}
+STAYS = {"gsmap", *BUILT_ON["gsmap"]}
 DELETED = [method.name for method in METHODS if method.name not in STAYS]
 BUILD = """
 import sys
@@ -52,7 +53,11 @@ sys.exit(pytest.main(["--collect-only", "-q", "-p", "no:cacheprovider", "tests"]
 
 def gone_with(name: str) -> set[str]:
     """Return a method and those that are built on it."""
-    return {name, *(method.name for method in METHODS if name in method.built_on)}
+    names = {name}
+    for method in METHODS:
+        if name in method.built_on:
+            names.add(method.name)
+    return names
 
 
 def places(name: str) -> list[Path]:
@@ -64,25 +69,24 @@ def places(name: str) -> list[Path]:
 @cache
 def names_in(path: Path) -> frozenset[str]:
     """Return the full names that a file imports, within functions too."""
-    nodes = list(ast.walk(ast.parse(path.read_text())))
-    plain = {alias.name for n in nodes if isinstance(n, ast.Import) for alias in n.names}
-    return frozenset(plain).union(
-        f"{n.module}.{alias.name}"
-        for n in nodes
-        if isinstance(n, ast.ImportFrom)
-        for alias in n.names
-    )
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return frozenset(names)
 
 
 @cache
 def registered(name: str) -> frozenset[str]:
     """Return the classes that a method registers."""
-    return frozenset(
-        node.name
-        for path in (REPO / MODELS / name).glob("*.py")
-        for node in ast.parse(path.read_text()).body
-        if isinstance(node, ast.ClassDef) and node.decorator_list
-    )
+    names = set()
+    for path in (REPO / MODELS / name).glob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and node.decorator_list:
+                names.add(node.name)
+    return frozenset(names)
 
 
 def leaves() -> list[Path]:
@@ -93,35 +97,44 @@ def leaves() -> list[Path]:
 
 def chain(path: Path) -> set[Path]:
     """Return a config and all that it inherits from, from the repository's root."""
-    bases = Config._get_base_files(str(REPO / path))
-    below = [Path(os.path.normpath(path.parent / base)) for base in bases]
-    return {path}.union(*map(chain, below))
+    paths = {path}
+    for base in Config._get_base_files(str(REPO / path)):
+        paths |= chain(Path(os.path.normpath(path.parent / base)))
+    return paths
 
 
 def types_of(value: Any) -> set[str]:
     """Return the registry names in a config's value."""
+    types = set()
     if isinstance(value, dict):
-        own = {str(value["type"])} if "type" in value else set()
-        return own.union(*map(types_of, value.values()))
-    if isinstance(value, (list, tuple)):
-        return set().union(*map(types_of, value))
-    return set()
+        if "type" in value:
+            types.add(str(value["type"]))
+        for entry in value.values():
+            types |= types_of(entry)
+    elif isinstance(value, (list, tuple)):
+        for entry in value:
+            types |= types_of(entry)
+    return types
 
 
 @cache
 def used_by(path: Path) -> frozenset[str]:
     """Return the methods that a config uses: by its bases, or by the types of its parts."""
     bases = {base.parts[1] for base in chain(path) if base.parts[0] == "configs"}
-    types = types_of(Config.fromfile(REPO / path, import_custom_modules=False).to_dict())
-    return frozenset(
-        method.name for method in METHODS if method.name in bases or types & registered(method.name)
-    )
+    config = Config.fromfile(REPO / path, import_custom_modules=False)
+    types = types_of(config.to_dict())
+    names = set()
+    for method in METHODS:
+        if method.name in bases or types & registered(method.name):
+            names.add(method.name)
+    return frozenset(names)
 
 
 @pytest.mark.parametrize("name", [method.name for method in METHODS])
 def test_a_method_has_its_places(name):
-    there = [path for path in places(name) if (REPO / path).exists()]
-    missing = {path.parts[0] for path in places(name)} - {path.parts[0] for path in there}
+    roots = {path.parts[0] for path in places(name)}
+    there = {path.parts[0] for path in places(name) if (REPO / path).exists()}
+    missing = roots - there
     # GSMap has a project of its own, with its configs and its page; docs/migration.md is MapTR's
     assert missing == {"gsmap": {"configs", "docs"}, "maptr": {"docs"}}.get(name, set())
     assert registered(name)
@@ -131,18 +144,18 @@ def test_a_method_has_its_places(name):
 def test_what_is_left_imports_nothing_of_a_method(name):
     gone = gone_with(name)
     assert not gone & STAYS
+    gone_places = []
+    for method in gone:
+        gone_places += places(method)
     for path in sorted(REPO.glob("*/**/*.py")):
         where = path.relative_to(REPO)
         if where.parts[0] not in ("projects", "tools", "benchmarks", "tests", "docs"):
             continue
-        if any(where.is_relative_to(place) for method in gone for place in places(method)):
+        if any(where.is_relative_to(place) for place in gone_places):
             continue
-        found = {
-            match[1]
-            for full in names_in(path)
-            if (match := re.match(r"(?:gsmap\.models|methods)\.(\w+)(?:\.|$)", full))
-        }
-        assert not found & gone, where
+        for full in names_in(path):
+            match = re.match(r"(?:gsmap\.models|methods)\.(\w+)(?:\.|$)", full)
+            assert match is None or match[1] not in gone, where
 
 
 @pytest.mark.parametrize("path", leaves(), ids=str)
@@ -150,8 +163,8 @@ def test_a_config_uses_only_what_its_method_is_built_on(path):
     """Configs of GSMap combine methods; each goes with any of those."""
     if path.is_relative_to(COMBINATIONS) or len(path.parts) == 2:
         return
-    (method,) = (method for method in METHODS if method.name == path.parts[1])
-    assert used_by(path) <= {method.name, *method.built_on}
+    name = path.parts[1]
+    assert used_by(path) <= {name, *BUILT_ON[name]}
 
 
 @pytest.fixture(scope="module")
@@ -167,8 +180,10 @@ def copy(tmp_path_factory) -> Path:
             shutil.copytree(path, root / path.name, ignore=unneeded, symlinks=True)
         elif path.is_file() and path.name != ".git":
             shutil.copy(path, root)
-    combined = [path for path in leaves() if used_by(path) & {*DELETED}]
-    for path in [*combined, *(place for name in DELETED for place in places(name))]:
+    deleted = [path for path in leaves() if used_by(path) & {*DELETED}]
+    for name in DELETED:
+        deleted += places(name)
+    for path in deleted:
         if (root / path).is_dir():
             shutil.rmtree(root / path)
         else:
@@ -183,8 +198,9 @@ def copy(tmp_path_factory) -> Path:
 
 def run_in(root: Path, *words: object) -> Any:
     """Run Python in a copy, with its packages before those that are installed."""
-    folders = [*(root / "projects" / name for name in PACKAGES), root, root / "tools"]
-    path = os.pathsep.join(map(str, [*folders, root / "tests"]))
+    folders = [root / "projects" / name for name in PACKAGES]
+    folders += [root, root / "tools", root / "tests"]
+    path = os.pathsep.join(map(str, folders))
     return run_python(*words, cwd=root, env={"PYTHONPATH": path})
 
 
