@@ -139,7 +139,7 @@ def _add_blank_cameras(item: dict[str, Any], cameras: Sequence[str]) -> dict[str
         "lidar2img": augmentation @ intrinsics @ OUT_OF_SIGHT,
     }
     index_of_name = {name: index for index, name in enumerate(meta["cam_names"])}
-    indices = list(map(index_of_name.get, cameras))  # None for an absent camera
+    indices = [index_of_name.get(name) for name in cameras]  # None for an absent camera
     all_images: list[torch.Tensor] = []
     all_paths: list[Any] = []
     for index in indices:

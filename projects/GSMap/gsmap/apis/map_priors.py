@@ -93,14 +93,20 @@ def open_priors(
     from gsmap.prior.opening import open_prior
 
     require_prior(model)
-    new_paths = [path for path in paths if update and not path.exists()]
-    known_paths = [path for path in paths if path not in new_paths]
+    new_paths = []
+    known_paths = []
+    for path in paths:
+        if update and not path.exists():
+            new_paths.append(path)
+        else:
+            known_paths.append(path)
     priors: dict[Path, AnyPrior] = {}
     # Files that are created come last, because the places of the others decide on theirs.
     for path in [*known_paths, *new_paths]:
         if path in new_paths:
             known_places = [prior.settings.place for prior in priors.values()]
-            place = _new_place(new_paths, set(places).difference(known_places))
+            other_places = set(places).difference(known_places)
+            place = _new_place(new_paths, other_places)
             with model.prior.new_prior(place) as empty_prior:
                 empty_prior.save(path)
         prior = open_prior(path, update=update)
@@ -123,8 +129,10 @@ def _new_place(paths: Sequence[Path], places: Collection[str]) -> str:
     if len(paths) == len(places) == 1:
         (place,) = places
         return place or paths[0].stem
-    subject = f"{paths[0]} does" if len(paths) == 1 else f"{' and '.join(map(str, paths))} do"
-    names = ", ".join(sorted(place or "an unknown place" for place in places))
+    files = " and ".join(map(str, paths))
+    subject = f"{files} does" if len(paths) == 1 else f"{files} do"
+    place_names = sorted(place or "an unknown place" for place in places)
+    names = ", ".join(place_names)
     raise InputError(
         f"{subject} not exist, and the samples without a prior are in {names or 'no other place'}: "
         "make the prior of each place from the samples of this place alone, by --token or a "
