@@ -100,13 +100,13 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     def step() -> None:
         models.advance_samples(batch)  # a temporal model expects the next frame
         # Copies, because a training step may change its input.
-        data = {
-            "inputs": {"img": list(images)},
-            "data_samples": [sample.clone() for sample in batch],
-        }
+        samples = [sample.clone() for sample in batch]
+        data = {"inputs": {"img": list(images)}, "data_samples": samples}
         figures = model.train_step(data, wrapper)
         # As in a training, the losses and statistics are added to the histories for the log.
-        prefixed = {f"train/{name}": value for name, value in figures.items()}
+        prefixed = {}
+        for name, value in figures.items():
+            prefixed[f"train/{name}"] = value
         keep_figures(wrapper.message_hub, prefixed)
 
     if device.type == "cpu":
