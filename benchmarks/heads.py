@@ -10,7 +10,7 @@ features. ``python -m benchmarks shape`` reads their predictions, ``NAME-SEED/re
 import argparse
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -95,12 +95,12 @@ def run(args: argparse.Namespace) -> None:
     """
     # Config file and overrides of each variant, as one text, by the name of the variant.
     variants: dict[str, str] = json.loads(args.variants.read_text())
-    settings = {key: str(getattr(args, key)) for key in _FIGURE_OPTIONS}
-    feature_files = {split: args.out / f"{split}.pt" for split in ("train", "val")}
+    settings = _option_values(args, _FIGURE_OPTIONS)
+    feature_files = {"train": args.out / "train.pt", "val": args.out / "val.pt"}
     feature_settings = args.out / "settings.json"
     if feature_files["train"].exists() and not feature_settings.exists():
         raise InputError(f"{args.out} holds features of unknown settings: give another --out.")
-    settings_of_file = {feature_settings: {key: settings[key] for key in _FEATURE_OPTIONS}}
+    settings_of_file = {feature_settings: _option_values(args, _FEATURE_OPTIONS)}
     for name, variant in variants.items():
         path = args.out / f"{name}.settings.json"
         settings_of_file[path] = {**settings, "variant": variant}
@@ -139,6 +139,14 @@ def run(args: argparse.Namespace) -> None:
     header = ["head", "seed", "divider", "ped_crossing", "boundary", "mean"]
     print(f"\n{args.iterations} iterations of {args.batch}, AP_chamfer / AP_raster\n")
     print(markdown_table(header, rows))
+
+
+def _option_values(args: argparse.Namespace, names: Sequence[str]) -> dict[str, str]:
+    """Values of options as texts, by name."""
+    values = {}
+    for name in names:
+        values[name] = str(getattr(args, name))
+    return values
 
 
 def record_settings(settings_of_file: Mapping[Path, dict[str, str]]) -> None:
@@ -252,11 +260,14 @@ def train_and_test(
             batches = list(order.split(args.batch))  # batches of the next epoch
         sample_inds = batches.pop()
         inputs = {"bev_feats": train_data["feats"][sample_inds].float()}
-        losses = head.loss(inputs, [train_data["samples"][i] for i in sample_inds.tolist()])
+        samples = [train_data["samples"][index] for index in sample_inds.tolist()]
+        losses = head.loss(inputs, samples)
         optimizer.zero_grad(set_to_none=True)
-        # Other entries of `losses` are statistics.
-        terms = [value for name, value in losses.items() if "loss" in name]
-        sum(terms).backward()
+        total: Any = 0
+        for name, value in losses.items():
+            if "loss" in name:  # other entries are statistics
+                total = total + value
+        total.backward()
         torch.nn.utils.clip_grad_norm_(head.parameters(), optim_cfg.clip_grad.max_norm)
         optimizer.step()
         schedule.step()
