@@ -23,7 +23,8 @@ from gsmap.models.vectormapnet.targets import FormatPolylineTargets
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid
 
-CONFIG, STATE = "vectormapnet/vectormapnet_r50_130e.py", "vectormapnet_state.json"
+CONFIG = "vectormapnet/vectormapnet_r50_130e.py"
+STATE = "vectormapnet_state.json"
 GRID = BEVGrid((-30.0, 30.0), (-15.0, 15.0))
 SIZE = np.array([200.0, 100.0])
 
@@ -40,9 +41,8 @@ class VectorParts(GoldenParts):
 
     def normal(self, name: str, shape: tuple[int, ...], **settings: float) -> Tensor:
         """Return a normal array."""
-        return torch.from_numpy(
-            self.golden.inputs.normal(name, shape, self.golden.seed, **settings)
-        )
+        values = self.golden.inputs.normal(name, shape, self.golden.seed, **settings)
+        return torch.from_numpy(values)
 
     def gradient_rows(  # type: ignore[override]
         self, name: str, data: Mapping[str, np.ndarray], gradients: Mapping[str, Tensor]
@@ -66,10 +66,9 @@ def split(data: Mapping[str, np.ndarray], key: str, count: str) -> list[np.ndarr
 def targets_of(data: Mapping[str, np.ndarray], tag: str) -> tuple[InstanceData, list[np.ndarray]]:
     """Return our targets of a set's annotated lines."""
     lines = split(data, f"{tag}_src_f64", f"{tag}_src_count")
-    elements = [
-        MapInstance(int(label), line)
-        for label, line in zip(data[f"{tag}_label"], lines, strict=True)
-    ]
+    elements = []
+    for label, line in zip(data[f"{tag}_label"], lines, strict=True):
+        elements.append(MapInstance(int(label), line))
     results: dict[str, Any] = {"map_instances": elements, "token": tag}
     results |= {"x_range": GRID.x_range, "y_range": GRID.y_range}
     return FormatPolylineTargets().transform(results)["gt_instances_3d"], lines
@@ -81,28 +80,32 @@ def check_targets(golden: Golden, name: str) -> Iterator[Row]:
     data = golden.read_arrays(name)
     for tag in ("closed", "many"):
         ours, lines = targets_of(data, tag)
-        canvas, transform = Canvas(GRID), FormatPolylineTargets()
+        canvas = Canvas(GRID)
+        transform = FormatPolylineTargets()
         wanted = split(data, f"{tag}_vec_f64", f"{tag}_vec_count")
-        found = [canvas.norm_from_metres(transform.simplify(line)) for line in lines]
-        off = max(largest_difference(*pair) for pair in zip(found, wanted, strict=True))
-        yield Row(name, f"{tag}: simplified lines", off, 1e-12)
+        offs = []
+        for line, wanted_line in zip(lines, wanted, strict=True):
+            simplified = canvas.norm_from_metres(transform.simplify(line))
+            offs.append(largest_difference(simplified, wanted_line))
+        yield Row(name, f"{tag}: simplified lines", max(offs), 1e-12)
         off = largest_difference(ours.keypoints, data[f"{tag}_keypoint"])
         yield Row(name, f"{tag}: key points (pixels)", off, 1e-4)
         off = largest_difference(ours.keypoint_tokens, data[f"{tag}_qkeypoint"])
         yield Row(name, f"{tag}: tokens of key points", off, 0)
         counts = data[f"{tag}_token_count"]
         for key, value in (("tokens", ours.tokens), ("weights_f64", ours.token_weights)):
-            rows = zip(value.numpy(), counts, strict=True)
-            flat = np.concatenate([row[:count] for row, count in rows])
-            off = largest_difference(flat, data[f"{tag}_{key}"])
+            parts = []
+            rest = 0  # sum of the entries behind the stops
+            for row, count in zip(value.numpy(), counts, strict=True):
+                parts.append(row[:count])
+                rest += np.abs(row[count:]).sum()
+            off = largest_difference(np.concatenate(parts), data[f"{tag}_{key}"])
             yield Row(name, f"{tag}: {key}", off, 1e-6 if "weights" in key else 0)
-            rest = sum(
-                np.abs(row[count:]).sum() for row, count in zip(value.numpy(), counts, strict=True)
-            )
             yield Row(name, f"{tag}: {key} behind the stop", rest, 0)
     generator = VectorParts(golden).head().generator
     for key, by_x in (("bbox", True), ("poly", False)):
-        before, after = (torch.from_numpy(data[f"aug_{key}_{w}"]).long() for w in ("in", "out"))
+        before = torch.from_numpy(data[f"aug_{key}_in"]).long()
+        after = torch.from_numpy(data[f"aug_{key}_out"]).long()
         noise = after - before  # of the numbers that the release drew
         moved = generator.shift(before, noise, by_x)
         if key == "poly":  # what is behind a line stays 0
@@ -113,7 +116,8 @@ def check_targets(golden: Golden, name: str) -> Iterator[Row]:
 @check("vectormapnet_detector_{variant}.npz")
 def check_detector(golden: Golden, name: str) -> Iterator[Row]:
     """Compare the element detector: states, boxes, scores, gradients and what is kept."""
-    data, parts = golden.read_arrays(name), VectorParts(golden)
+    data = golden.read_arrays(name)
+    parts = VectorParts(golden)
     detector = KeyPointHead(GRID, ("a", "b", "c"), num_queries=12)
     initial = KeyPointHead(GRID, ("a", "b", "c"))
     initial.init_weights()
@@ -162,34 +166,41 @@ def kept_rows(
     """Compare the elements that are kept, and their boxes for the generator."""
     output = KeyPointPredictions(*(part.detach() for part in output))
     results = detector.predict_by_feat([output], [{}] * len(output.scores))
-    boxes = [head.canvas.norm_from_metres(each.pts) * torch.tensor(SIZE) for each in results]
-    flat = [head.boxes(each) for each in results]
+    scores = []
+    labels = []
+    boxes = []
+    boxes_for_generator = []
+    for result in results:
+        scores.append(result.scores_3d)
+        labels.append(result.labels_3d)
+        pixels = head.canvas.norm_from_metres(result.pts) * torch.tensor(SIZE)
+        boxes.append(pixels.flatten(1))
+        boxes_for_generator.append(head.boxes(result))
     ours = {
-        "post_scores": ([each.scores_3d for each in results], 5e-4),
-        "post_bbox": ([each.flatten(1) for each in boxes], 1e-2),
-        "post_labels": ([each.labels_3d for each in results], 0),
+        "post_scores": (scores, 5e-4),
+        "post_bbox": (boxes, 1e-2),
+        "post_labels": (labels, 0),
     }
     for key, (value, tolerance) in ours.items():
         found = torch.stack(value).numpy()
         off = largest_difference(found.reshape(data[key].shape), data[key])
         yield Row(name, key, off, tolerance)
-    off = largest_difference(torch.cat(flat), data["post_bbox_flat"])
+    off = largest_difference(torch.cat(boxes_for_generator), data["post_bbox_flat"])
     yield Row(name, "post_bbox_flat", off, 0)
 
 
 @check("vectormapnet_losses_{variant}.npz")
 def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     """Compare costs, matches, losses and gradients on given predictions."""
-    data, head = golden.read_arrays(name), VectorParts(golden).head().detector
+    data = golden.read_arrays(name)
+    head = VectorParts(golden).head().detector
     lines = torch.from_numpy(data["in_lines"]).requires_grad_()
     scores = torch.from_numpy(data["in_scores"]).requires_grad_()
-    truths = [
-        InstanceData(
-            keypoints=torch.from_numpy(data[f"gt_keypoint_b{i}"]),
-            labels_3d=torch.from_numpy(data[f"gt_label_b{i}"]),
-        )
-        for i in range(2)
-    ]
+    truths = []
+    for i in range(2):
+        keypoints = torch.from_numpy(data[f"gt_keypoint_b{i}"])
+        labels = torch.from_numpy(data[f"gt_label_b{i}"])
+        truths.append(InstanceData(keypoints=keypoints, labels_3d=labels))
     costs = head.costs(scores[-1, 0].detach(), lines[-1, 0].detach(), truths[0]).sum(0)
     yield Row(name, "cost_last_b0", largest_difference(costs, data["cost_last_b0"]), 1e-4)
     wrong = 0.0
@@ -199,10 +210,10 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
             expected = data[f"match_l{layer}_b{i}"]
             wrong = max(wrong, largest_difference(torch.stack(pairs, 1), expected))
     yield Row(name, "pairs", wrong, 0)
-    outputs = [
-        KeyPointPredictions(*part) for part in zip(scores, lines.unflatten(-1, (2, 2)), strict=True)
-    ]
-    losses = [torch.stack(head.layer_losses(output, truths, ["a", "b"])) for output in outputs]
+    losses = []
+    for layer_scores, corners in zip(scores, lines.unflatten(-1, (2, 2)), strict=True):
+        output = KeyPointPredictions(layer_scores, corners)
+        losses.append(torch.stack(head.layer_losses(output, truths, ["a", "b"])))
     both = torch.stack(losses, 1)
     for key, value in zip(("loss_cls", "loss_reg"), both, strict=True):
         off = largest_relative(value.detach(), data[key].reshape(-1))
@@ -216,19 +227,20 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
 @torch.no_grad()
 def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     """Compare the way from the images to the lines of the first eight elements."""
-    data, model = golden.read_arrays(name), golden.model(CONFIG, STATE)
+    data = golden.read_arrays(name)
+    model = golden.model(CONFIG, STATE)
     size = (192, 320)
     images = torch.from_numpy(golden.inputs.images(*size, NUM_CAMS, golden.seed))
     levels = model.extract_img_feats(images[None])
-    encoder, head = model.bev_encoder, model.map_head
+    encoder = model.bev_encoder
+    head = model.map_head
     feats = encoder.merge_levels(levels)
-    cameras = [golden.cameras["cameras"][key] for key in golden.cameras["camera_order"]]
-    matrices = [
-        np.diag([0.2, 0.2, 1, 1])
-        @ np.array(camera["intrinsics_1600x900"])
-        @ np.linalg.inv(camera["camera2ego"])
-        for camera in cameras
-    ]
+    scale = np.diag([0.2, 0.2, 1, 1])
+    matrices = []
+    for key in golden.cameras["camera_order"]:
+        camera = golden.cameras["cameras"][key]
+        cam_from_ego = np.linalg.inv(camera["camera2ego"])
+        matrices.append(scale @ np.array(camera["intrinsics_1600x900"]) @ cam_from_ego)
     meta = {"lidar2img": matrices, "lidar2ego": np.eye(4)}
     (ground,) = calibration_arrays(meta, ["img_from_ground"]).values()
     seen = encoder.project(torch.from_numpy(ground)[None], size)
@@ -253,8 +265,8 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
         "ipm_sub": (whole[::10, :, ::5, ::5], 1e-3),
         "bev_sub": (bev[0, ::8, ::5, ::5], 1e-3),
         "neck": (neck[0, ::8], 1e-3),
-        "all_lines": (torch.stack([o.references.flatten(2) for o in chosen]), 1e-2),
-        "all_scores": (torch.stack([o.scores for o in chosen]), 1e-3),
+        "all_lines": (torch.stack([output.references.flatten(2) for output in chosen]), 1e-2),
+        "all_scores": (torch.stack([output.scores for output in chosen]), 1e-3),
     }
     for key, (value, tolerance) in ours.items():
         yield Row(name, key, largest_difference(value, data[key]), tolerance)
@@ -275,6 +287,9 @@ def line_rows(
     yield Row(name, "tokens", off, 0)
     points, count = head.generator.lines(tokens)
     yield Row(name, "lines_count", largest_difference(count, data["lines_count"]), 0)
-    found = np.concatenate([line[:n] for line, n in zip(points.numpy(), count, strict=True)])
+    lines = []
+    for line, num_points in zip(points.numpy(), count, strict=True):
+        lines.append(line[:num_points])  # without padding
+    found = np.concatenate(lines)
     off = largest_difference(head.canvas.norm_from_metres(found), data["lines_norm"])
     yield Row(name, "lines_norm", off, 1e-5)
