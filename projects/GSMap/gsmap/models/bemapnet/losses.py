@@ -204,19 +204,25 @@ class BezierLosses(LineLosses):
             "curve": self.curve * _mean_difference(lines.curves, truth.curves),
             "recovery": self.recovery * recovery_loss(mask_values),
         }
-        losses = {name: value.sum() / divisor for name, value in line_losses.items()}
+        losses = {}
+        for name, value in line_losses.items():
+            losses[name] = value.sum() / divisor
         losses["cls"] = self.class_loss(cases, rows)  # over all predictions, matched or not
         return losses
 
 
 def _select(lines: Any, index: Tensor) -> Any:
     """Select lines in all fields of a tuple. (n, ...) each -> (M, ...) each"""
-    return type(lines)._make(values[index] for values in lines)
+    fields = [values[index] for values in lines]
+    return type(lines)._make(fields)
 
 
 def _concatenate(samples: Sequence[Any]) -> Any:
     """Concatenate tuples of all samples field by field. (m, ...) each -> (M, ...) each"""
-    return type(samples[0])._make(torch.cat(values) for values in zip(*samples, strict=True))
+    fields = []
+    for values in zip(*samples, strict=True):
+        fields.append(torch.cat(values))
+    return type(samples[0])._make(fields)
 
 
 def _mean_difference(points: Tensor, others: Tensor) -> Tensor:
