@@ -130,7 +130,8 @@ class StaticFrame(nn.Module):
         for name, value in fields.items():
             layout[name] = (value.shape[1:], value.dtype)
             # The added axis gives a field of one number per element a column, too.
-            columns.append(value.unsqueeze(-1).flatten(1).float())  # (M, entries of the field)
+            entries = value.unsqueeze(-1).flatten(1)  # (M, entries of the field)
+            columns.append(entries.float())
         self.layout = layout
         return torch.cat(columns, dim=1)
 
@@ -203,9 +204,11 @@ class FastFrames:
 
     def serves(self, batch: dict[str, Any]) -> bool:
         """Whether a batch consists of images of one size and has no other inputs."""
-        images = batch["inputs"].get("img")
-        shapes = {tuple(image.shape) for image in images or ()}
-        return len(shapes) == 1 and set(batch["inputs"]) == {"img"}
+        inputs = batch["inputs"]
+        shapes = set()
+        for image in inputs.get("img") or ():
+            shapes.add(tuple(image.shape))
+        return len(shapes) == 1 and set(inputs) == {"img"}
 
     def __call__(self, batch: dict[str, Any]) -> "list[Det3DDataSample]":
         """Predict the samples of a collated batch.
@@ -342,9 +345,12 @@ class FastFrames:
         is_valid = head.coder.keep_mask(fields["scores_3d"], fields["pts"])
         scores = fields.pop("scores_3d")[is_valid]
         labels = fields.pop("labels_3d")[is_valid]
-        detections = {name: value[is_valid] for name, value in fields.items()}
+        detections = {}
+        for name, value in fields.items():
+            detections[name] = value[is_valid]
         # For some classes, the points of lines are reordered to a short path.
         detections = head.coder.unfold_lines(detections, labels)
         detections.update(scores_3d=scores, labels_3d=labels)
         instances = InstanceData(metainfo=dict(head.reference.metainfo), **detections)
-        return self.frame.model.add_pred_to_datasample([sample], [instances])[0]
+        samples = self.frame.model.add_pred_to_datasample([sample], [instances])
+        return samples[0]

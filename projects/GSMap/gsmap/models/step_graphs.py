@@ -201,7 +201,8 @@ class StepGraphs:
             )
         # The key is the size of the step: the shapes and types of the inputs, and the number of
         # parameters, which changes if some of them are frozen during the training.
-        key = (len(params), *((tensor.shape, tensor.dtype) for tensor in inputs))
+        sizes = [(tensor.shape, tensor.dtype) for tensor in inputs]
+        key = (len(params), *sizes)
         recording = self._recordings.get(key)
         if recording is None:
             while len(self._recordings) >= _MOST_SIZES:
@@ -325,7 +326,11 @@ def _record(model: Any, inputs: Sequence[Tensor], params: Sequence[Tensor]) -> _
 
 def _empty_grads(outputs: Sequence[Tensor]) -> list[Tensor | None]:
     """Allocate memory for the gradient of each output; None for outputs without gradients."""
-    return [torch.zeros_like(output) if output.requires_grad else None for output in outputs]
+    grads: list[Tensor | None] = []
+    for output in outputs:
+        grad = torch.zeros_like(output) if output.requires_grad else None
+        grads.append(grad)
+    return grads
 
 
 @contextmanager
