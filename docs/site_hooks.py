@@ -10,7 +10,6 @@ import html
 import posixpath
 import re
 from importlib import import_module
-from itertools import accumulate
 from pathlib import Path
 
 from latex2mathml.converter import convert
@@ -72,7 +71,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     without a page are left out.
     """
     # The navigation has exactly one part "Models", a list of entries {title: page}.
-    (models,) = (part["Models"] for part in config.nav or () if "Models" in part)
+    sections = [part["Models"] for part in config.nav or () if "Models" in part]
+    (models,) = sections
     # The enumeration starts at 1, so the number is the index after the entry of methods.md.
     position = next(n for n, page in enumerate(models, start=1) if "methods.md" in page.values())
     entries = []
@@ -144,6 +144,11 @@ def with_import(heading: re.Match[str]) -> str:
         heading: Match of ``NAME``, whose groups are the module and the name.
     """
     module, name = heading.groups()
-    packages = accumulate(module.split("."), "{}.{}".format)  # a, a.b and a.b.c for a.b.c
-    exporters = (path for path in packages if name in getattr(import_module(path), "__all__", ()))
-    return f"{heading[0]}<p><code>from {next(exporters, module)} import {name}</code></p>"
+    exporter = module
+    package = ""
+    for part in module.split("."):  # the packages a, a.b and a.b.c of a.b.c
+        package = f"{package}.{part}" if package else part
+        if name in getattr(import_module(package), "__all__", ()):
+            exporter = package
+            break
+    return f"{heading[0]}<p><code>from {exporter} import {name}</code></p>"
