@@ -51,11 +51,15 @@ def run_pipeline(steps, seed, **options):
     return Compose([TRANSFORMS.build(step) for step in steps])(sample_of(seed, **options))
 
 
+def run_on(load, steps, seeds):
+    """Return what a pipeline makes of the samples of several seeds."""
+    return [run_pipeline([load, *steps, PACK], seed) for seed in range(seeds)]
+
+
 def collate(*items, device="cpu"):
-    data = {
-        "inputs": {"img": [item["inputs"]["img"] for item in items]},
-        "data_samples": [item["data_samples"] for item in items],
-    }
+    images = [item["inputs"]["img"] for item in items]
+    samples = [item["data_samples"] for item in items]
+    data = {"inputs": {"img": images}, "data_samples": samples}
     preprocessor = {"type": "MapDataPreprocessor", "pad_size_divisor": 32}
     return MODELS.build(preprocessor).to(device)(data)["inputs"]["imgs"]
 
@@ -71,8 +75,8 @@ def test_distortion_is_that_of_mmdet3d(seed):
     "steps", [[DISTORT, SCALE], [SCALE, DISTORT], [SCALE], [CROP, SCALE], [DISTORT, SCALE, CROP]]
 )
 def test_a_batch_on_the_device_equals_that_of_the_host(steps):
-    on_host = [run_pipeline([LOAD, *steps, PACK], seed) for seed in range(24)]
-    noted = [run_pipeline([ON_DEVICE, *steps, PACK], seed) for seed in range(24)]
+    on_host = run_on(LOAD, steps, seeds=24)
+    noted = run_on(ON_DEVICE, steps, seeds=24)
     assert {item["inputs"]["img"].dtype for item in noted} == {torch.uint8}
     for ours, theirs in zip(noted, on_host, strict=True):
         for name in ("lidar2img", "img_aug_matrix"):
@@ -88,10 +92,10 @@ def test_bicubic_scaling_is_pillows():
     """As released code scales: antialiased, so that no pixel is left out, to whole grey levels."""
     scale = {"type": "ScaleImages", "size": (21, 8), "kernel": "bicubic"}
     images = sample_of(3)["images"]
-    wanted = [
-        np.asarray(Image.fromarray(camera["img_path"]).resize((21, 8)))  # Pillow's own default
-        for camera in images.values()
-    ]
+    wanted = []
+    for camera in images.values():
+        image = Image.fromarray(camera["img_path"])
+        wanted.append(np.asarray(image.resize((21, 8))))  # Pillow's own default
     for load in ({**LOAD, "to_float32": False}, LOAD):  # floats that are whole
         found = run_pipeline([load, scale, PACK], 3)["inputs"]["img"]  # (V, 3, H, W)
         assert np.array_equal(found.permute(0, 2, 3, 1).numpy(), np.stack(wanted))
@@ -103,8 +107,8 @@ def test_bicubic_scaling_is_pillows():
 @pytest.mark.parametrize("size", [(21, 8), (200, 111), (96, 54), (40, 100)])
 def test_bicubic_scaling_on_the_device_equals_pillows_to_a_grey_level(size):
     scale = {"type": "ScaleImages", "size": size, "kernel": "bicubic"}
-    on_host = collate(*[run_pipeline([LOAD, scale, PACK], seed) for seed in range(4)])
-    noted = collate(*[run_pipeline([ON_DEVICE, scale, PACK], seed) for seed in range(4)])
+    on_host = collate(*run_on(LOAD, [scale], seeds=4))
+    noted = collate(*run_on(ON_DEVICE, [scale], seeds=4))
     apart = (noted - on_host).abs()
     assert apart.max() <= 1.0  # a tie between two levels; Pillow rounds its weights to 22 bits
     assert (apart > 0).float().mean() < 0.01
@@ -115,44 +119,48 @@ def test_an_unknown_kernel_is_refused():
         TRANSFORMS.build({"type": "ScaleImages", "scale": 0.5, "kernel": "lanczos"})
 
 
+def distortion_numbers(step, seeds):
+    """Return the numbers that are drawn for each image of some samples."""
+    numbers = []
+    for item in run_on(ON_DEVICE, [step], seeds):
+        numbers += item["data_samples"].image_steps[0].numbers
+    return numbers
+
+
 def test_channels_stay_where_no_swap_is_asked_for():
     """Only the swap goes: all other numbers are those that are drawn with it."""
-    for seed in range(8):
-        swapped, kept = (
-            run_pipeline([ON_DEVICE, {**DISTORT, **options}, PACK], seed)["data_samples"]
-            .image_steps[0].numbers
-            for options in ({}, {"swap_channels": False})
-        )  # fmt: skip
-        for with_swap, without in zip(swapped, kept, strict=True):
-            assert without[5] == 0
-            assert repr(with_swap[:5] + with_swap[6:]) == repr(without[:5] + without[6:])
-    found = run_pipeline([LOAD, {**DISTORT, "swap_channels": False}, PACK], 0)
-    wanted = run_pipeline([ON_DEVICE, {**DISTORT, "swap_channels": False}, PACK], 0)
+    without_swap = {**DISTORT, "swap_channels": False}
+    swapped = distortion_numbers(DISTORT, seeds=8)
+    kept = distortion_numbers(without_swap, seeds=8)
+    for with_swap, without in zip(swapped, kept, strict=True):
+        assert without[5] == 0
+        assert repr(with_swap[:5] + with_swap[6:]) == repr(without[:5] + without[6:])
+    found = run_pipeline([LOAD, without_swap, PACK], 0)
+    wanted = run_pipeline([ON_DEVICE, without_swap, PACK], 0)
     torch.testing.assert_close(collate(wanted), collate(found), atol=GREY_LEVELS, rtol=0)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_batch_on_a_gpu_equals_that_of_the_host():
     steps = [DISTORT, SCALE]
-    on_host = [run_pipeline([LOAD, *steps, PACK], seed) for seed in range(24)]
-    noted = [run_pipeline([ON_DEVICE, *steps, PACK], seed) for seed in range(24)]
+    on_host = run_on(LOAD, steps, seeds=24)
+    noted = run_on(ON_DEVICE, steps, seeds=24)
     found = collate(*noted, device="cuda")
     torch.testing.assert_close(found.cpu(), collate(*on_host), atol=GREY_LEVELS, rtol=0)
 
 
 def test_every_branch_of_the_distortion_was_compared():
     """The numbers of 24 samples of three images hold each flag, both orders and all sectors."""
-    noted = [run_pipeline([ON_DEVICE, DISTORT, PACK], seed) for seed in range(24)]
-    rows = [row for item in noted for row in item["data_samples"].image_steps[0].numbers]
+    rows = distortion_numbers(DISTORT, seeds=24)
     for column in range(6):
         assert {row[column] for row in rows} == {0, 1}
 
 
 def test_samples_of_different_steps_are_computed_one_by_one():
-    items = [
-        run_pipeline([ON_DEVICE, *steps, PACK], 0)
-        for steps in ([SCALE], [{"type": "ScaleImages", "size": (48, 27)}], [SCALE, DISTORT])
-    ]
+    other_scale = {"type": "ScaleImages", "size": (48, 27)}
+    items = []
+    for steps in ([SCALE], [other_scale], [SCALE, DISTORT]):
+        items.append(run_pipeline([ON_DEVICE, *steps, PACK], 0))
     together = collate(*items)
     for row, item in zip(together, items, strict=True):
         assert torch.equal(row, collate(item)[0])
@@ -160,9 +168,9 @@ def test_samples_of_different_steps_are_computed_one_by_one():
 
 def test_whole_grey_levels_stay_whole():
     """MiniCity scales uint8; a half is rounded up."""
-    steps = [{"to_float32": False}, {"to_float32": False, "on_device": True}]
-    load = [{**LOAD, **options} for options in steps]
-    on_host, noted = (run_pipeline([first, SCALE, PACK], 3) for first in load)
+    load = {**LOAD, "to_float32": False}
+    on_host = run_pipeline([load, SCALE, PACK], 3)
+    noted = run_pipeline([{**load, "on_device": True}, SCALE, PACK], 3)
     assert torch.equal(collate(noted), collate(on_host))
 
 
