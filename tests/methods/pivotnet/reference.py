@@ -91,16 +91,22 @@ SUBSETS = {  # what the file holds of each gradient
 @check("pivotnet_decoder_{variant}.npz")
 def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
     """Compare the point decoder: states, classes, masks, gradients."""
-    data, parts = golden.read_arrays(name), PivotParts(golden)
+    data = golden.read_arrays(name)
+    parts = PivotParts(golden)
     decoder = parts.head().decoder
     bev = parts.normal("pv_bev", (B, C, *BEV)).requires_grad_()
     cross: list[Tensor] = []  # behind the first attention
     decoder.layers[0].norms[0].register_forward_hook(lambda _, __, out: cross.append(out))
     outputs = decoder(bev)
-    logits = [torch.cat([own.logits for own in layer], 1) for layer in outputs]
-    masks = [torch.cat([own.masks for own in layer], 1) for layer in outputs]
-    states = [torch.cat([own.states.flatten(1, 2) for own in layer], 1) for layer in outputs]
-    blocked = [decoder.attention_mask(layer) for layer in outputs]
+    logits: list[Tensor] = []
+    masks: list[Tensor] = []
+    states: list[Tensor] = []
+    blocked: list[Tensor] = []
+    for layer in outputs:  # the lines of all classes, one class after another
+        logits.append(torch.cat([lines.logits for lines in layer], 1))
+        masks.append(torch.cat([lines.masks for lines in layer], 1))
+        states.append(torch.cat([lines.states.flatten(1, 2) for lines in layer], 1))
+        blocked.append(decoder.attention_mask(layer))
     ours = {
         "pred_logits": (torch.stack(logits), 3e-4),
         "mask_sub": (torch.stack(masks)[:, :, ::6, ::4, ::4], 3e-4),
@@ -119,13 +125,13 @@ def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
     shares = torch.stack(blocked).float().mean(3)[..., ends]
     off = largest_difference(shares, data["attn_blocked_fraction"])
     yield Row(name, "shares of blocked cells", off, 1e-3)
-    scalar = sum(
-        (value * parts.normal(f"pv_gd_logits{i}", tuple(value.shape))).sum()
-        + 0.01 * (mask * parts.normal(f"pv_gd_masks{i}", tuple(mask.shape))).sum()
-        for i, (value, mask) in enumerate(zip(logits, masks, strict=True))
-    )
-    last = states[-1]
-    scalar = scalar + 0.1 * (last * parts.normal("pv_gd_states", tuple(last.shape))).sum()
+    scalar = torch.zeros(())
+    for i, (value, mask) in enumerate(zip(logits, masks, strict=True)):
+        logits_noise = parts.normal(f"pv_gd_logits{i}", tuple(value.shape))
+        masks_noise = parts.normal(f"pv_gd_masks{i}", tuple(mask.shape))
+        scalar = scalar + ((value * logits_noise).sum() + 0.01 * (mask * masks_noise).sum())
+    states_noise = parts.normal("pv_gd_states", tuple(states[-1].shape))
+    scalar = scalar + 0.1 * (states[-1] * states_noise).sum()
     scalar.backward()
     yield Row(name, "scalar (relative)", largest_relative(scalar.detach(), data["scalar"]), 1e-4)
     gradients = {
@@ -143,7 +149,8 @@ def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
 @check("pivotnet_head_{variant}.npz")
 def check_head(golden: Golden, name: str) -> Iterator[Row]:
     """Compare points, their kinds and masks from the decoder's states, and gradients."""
-    data, parts = golden.read_arrays(name), PivotParts(golden)
+    data = golden.read_arrays(name)
+    parts = PivotParts(golden)
     head = parts.head()
     bev = parts.normal("pv_bev", (B, C, *BEV))
     with torch.no_grad():
@@ -167,10 +174,11 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
             weight = parts.normal(f"pv_gh_{word}{label}", tuple(value.shape))
             scalar = scalar + (value * weight).sum()
     levels = [parts.normal(f"pv_bev_level{i}", (B, C, *BEV)) for i in range(3)]
+    level_masks = []
     with torch.no_grad():
-        masks = torch.stack(
-            [head.class_masks(turn_raster(level, head.grid)) for level in (*levels, bev)]
-        )
+        for level in (*levels, bev):
+            level_masks.append(head.class_masks(turn_raster(level, head.grid)))
+    masks = torch.stack(level_masks)
     for label, kind in enumerate(CLASSES):
         off = largest_difference(
             masks[:, :, label, ::5, ::5], data[f"sem_mask_{kind}_sub"][:, :, 1]
@@ -203,7 +211,10 @@ def decoded_rows(
     scores = result.scores_3d.numpy()[order]
     yield Row(name, f"{tag}: scores", largest_difference(scores, data[f"{tag}_scores"]), 1e-4)
     points = head.grid.front_from_metres(result.pts).numpy()[order] * size
-    found = np.concatenate([line[:number] for line, number in zip(points, numbers, strict=True)])
+    pivots = []
+    for line, number in zip(points, numbers, strict=True):
+        pivots.append(line[:number])  # without padding
+    found = np.concatenate(pivots)
     off = largest_difference(found, data[f"{tag}_pivots"]) / max(size)
     yield Row(name, f"{tag}: pivots ([0, 1])", off, 1e-5 if tag == "post" else 1e-3)
 
@@ -212,7 +223,9 @@ def decoded_rows(
 @torch.no_grad()
 def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     """Compare the way from resized images to the lines, in the frame of the vehicle."""
-    data, parts, size = golden.read_arrays(name), PivotParts(golden), (192, 320)
+    data = golden.read_arrays(name)
+    parts = PivotParts(golden)
+    size = (192, 320)
     model = parts.model(
         grid={"x_range": (-30.0, 30.0), "y_range": (-15.0, 15.0)},
         bev_encoder={"image_size": size},
@@ -224,7 +237,8 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
         "feat16_sub": feats[0][0][:, ::32, ::3, ::4],
         "feat32_sub": feats[1][0][:, ::32, ::2, ::2],
     }
-    encoder, head = model.bev_encoder, model.map_head
+    encoder = model.bev_encoder
+    head = model.map_head
     memory = [level.flatten(2) for level in encoder.sources(feats)]
     subsets["memory_sub"] = torch.cat(memory, 2)[0, ::8, ::20].T
     bev = encoder.encode(feats, {"img_from_ground": ground_matrices(golden, size)}, size)
@@ -233,9 +247,12 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     for key, value in subsets.items():
         yield Row(name, key, largest_difference(value, data[key]), 1e-4)
     outputs = head(bev)
-    logits = torch.stack([torch.cat([own.logits for own in o.lines], 1) for o in outputs])
+    layer_logits = []
+    for output in outputs:
+        layer_logits.append(torch.cat([lines.logits for lines in output.lines], 1))
+    logits = torch.stack(layer_logits).numpy()
     # one line of a layer may have a mask logit so near 0 that noise lets it see another cell
-    off = np.sort(np.abs(logits.numpy() - data["obj_logits"]).max((1, 3)), 1)  # (layers, lines)
+    off = np.sort(np.abs(logits - data["obj_logits"]).max((1, 3)), 1)  # (layers, lines)
     yield Row(name, "obj_logits, but for one line of a layer", float(off[:, :-1].max()), 3e-4)
     yield Row(name, "obj_logits", float(off.max()), 3e-2)
     masks = head.class_masks(bev["bev_feats"])
