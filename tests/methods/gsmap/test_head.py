@@ -32,34 +32,52 @@ EMPTY = elements()
 @pytest.mark.parametrize("decoder", [HEAD["decoder"], DECOUPLED], ids=["joint", "decoupled"])
 def test_with_the_weights_of_another_head_its_points_and_scores_are_exactly_the_same(decoder, grid):
     settings = {"decoder": decoder, "grid": grid}
-    other, gsmap_head = build_head(MAPTR, **settings).eval(), build_head(GSMAP, **settings).eval()
+    other = build_head(MAPTR, **settings).eval()
+    gsmap_head = build_head(GSMAP, **settings).eval()
     for parameter in other.parameters():  # as if trained: no sampling offset is a round number
         parameter.data += 0.1 * torch.randn_like(parameter)
     left = gsmap_head.load_state_dict(other.state_dict(), strict=False)
     assert not left.unexpected_keys
     parts = ("reference.gaussian_init.", "reference.gaussian_branches.", ".guidance.embedding.")
-    assert all(any(part in key for part in parts) for key in left.missing_keys)
-    expected, actual = other(bev()), gsmap_head(bev())
+    for key in left.missing_keys:
+        assert any(part in key for part in parts)
+    expected = other(bev())
+    actual = gsmap_head(bev())
     assert torch.equal(stacked(actual).pts, stacked(expected).pts)
     assert torch.equal(stacked(actual).scores, stacked(expected).scores)
 
 
+def shapes_of(module: torch.nn.Module) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in module.state_dict().items()}
+
+
+def weights_of_costs(head: torch.nn.Module) -> list[float]:
+    return [cost.weight for cost in head.assigner.match_costs]
+
+
+def loss_names(losses: dict) -> set[str]:
+    """Names of losses, without statistics."""
+    return {name for name in losses if "loss" in name}
+
+
 def test_the_guided_attention_is_as_large_as_maptrs_and_drops_as_much():
     decoder = with_layer(MAPTR, dropout=0.25)
-    layers = [build_head(c, decoder=decoder).decoder.layers[0] for c in (MAPTR, GSMAP)]
-    assert [type(layer.guidance).__name__ for layer in layers] == ["NoneType", "GaussianGuidance"]
-    plain, guided = (layer.cross_attn for layer in layers)
-    assert guided.dropout.p == plain.dropout.p == 0.25
-    shapes = [{k: v.shape for k, v in part.state_dict().items()} for part in (plain, guided)]
-    assert shapes[0] == shapes[1]
+    plain = build_head(MAPTR, decoder=decoder).decoder.layers[0]
+    guided = build_head(GSMAP, decoder=decoder).decoder.layers[0]
+    assert plain.guidance is None
+    assert type(guided.guidance).__name__ == "GaussianGuidance"
+    assert guided.cross_attn.dropout.p == plain.cross_attn.dropout.p == 0.25
+    assert shapes_of(guided.cross_attn) == shapes_of(plain.cross_attn)
 
 
 def test_the_points_get_another_weight_in_loss_and_matching():
-    head, lighter = (build_head(GSMAP, **kw) for kw in ({}, {"points_weight": 1.0}))
-    assert (head.losses["pts"].loss_weight, lighter.losses["pts"].loss_weight) == (5.0, 1.0)
-    costs = [[cost.weight for cost in h.assigner.match_costs] for h in (head, lighter)]
-    assert costs[0][1:] == [5.0, 2.0]
-    assert costs[1] == [costs[0][0], 1.0, 2.0]
+    head = build_head(GSMAP)
+    lighter = build_head(GSMAP, points_weight=1.0)
+    assert head.losses["pts"].loss_weight == 5.0
+    assert lighter.losses["pts"].loss_weight == 1.0
+    class_weight, *others = weights_of_costs(head)
+    assert others == [5.0, 2.0]
+    assert weights_of_costs(lighter) == [class_weight, 1.0, 2.0]
 
 
 @pytest.mark.parametrize("kind", ["PointsLoss", "mmdet3d.PointsLoss", PointsLoss])
@@ -88,9 +106,11 @@ def test_the_older_form_of_a_gsmap_config_builds_the_same_head():
     )
     short = build_head(GSMAP)
     assert repr(older) == repr(short)
-    expected, losses = losses_of(short, LANES), losses_of(older, LANES)
+    expected = losses_of(short, LANES)
+    losses = losses_of(older, LANES)
     assert losses.keys() == expected.keys()
-    assert all(torch.equal(losses[name], expected[name]) for name in losses)
+    for name, loss in losses.items():
+        assert torch.equal(loss, expected[name])
 
 
 def test_every_parameter_learns():
@@ -98,19 +118,20 @@ def test_every_parameter_learns():
     for step in range(2):  # what feeds a matrix of zeros learns from the second step on
         losses = losses_of(head, LANES, EMPTY)
         head.zero_grad()
-        sum(value for name, value in losses.items() if "loss" in name).backward()
+        total = sum(losses[name] for name in losses if "loss" in name)
+        total.backward()
         with torch.no_grad():
             for parameter in head.parameters():
                 parameter -= 1e-3 * parameter.grad if step == 0 else 0
-    idle = [name for name, p in head.named_parameters() if not p.grad.abs().sum() > 0]
-    assert not idle
+    for name, parameter in head.named_parameters():
+        assert parameter.grad.abs().sum() > 0, name
 
 
 def test_each_layer_has_its_raster_loss_or_only_the_last():
     every = build_head(GSMAP)
     last = build_head(GSMAP, loss_raster={"type": "RasterLoss", "last_layer_only": True})
     names = {"loss_cls", "loss_pts", "loss_dir", "loss_raster"}
-    found = {name for name in losses_of(every, LANES) if "loss" in name}
+    found = loss_names(losses_of(every, LANES))
     assert found == names | {f"d0.{name}" for name in names}
     assert found - set(losses_of(last, LANES)) == {"d0.loss_raster"}
 
@@ -141,7 +162,8 @@ def test_the_raster_loss_reaches_centres_scales_and_angles():
     outputs = perfect_outputs(head, lane, scales=(0.2, 0.7), rotation=0.3)
     loss = head.loss_by_feat(outputs, [lane], [{}])["loss_raster"]
     (gradient,) = torch.autograd.grad(loss, outputs[-1].references)
-    matched, others = gradient[0, 0], gradient[0, 1:]
+    matched = gradient[0, 0]
+    others = gradient[0, 1:]
     assert (matched.abs().sum(0) > 0).all()  # each of mu_x, mu_y, sigma_x, sigma_y, theta
     assert not others.any()
 
@@ -192,14 +214,15 @@ def test_more_ground_truth_than_queries_is_matched_as_far_as_it_goes():
     head = build_head(GSMAP)
     crowd = elements(*along_y(*range(-9, 9, 2)))
     losses = losses_of(head, crowd)
-    assert all(torch.isfinite(loss) for loss in losses.values())
+    assert torch.stack(list(losses.values())).isfinite().all()
     assert losses["loss_raster"] > 0
 
 
 @pytest.mark.parametrize("part", ["guide_sampling", "embed_gaussians"])
 def test_parts_of_the_guided_layer_switch_off_by_themselves(part):
     decoder = with_layer(GSMAP, **{part: False})
-    head, full = build_head(GSMAP, decoder=decoder), build_head(GSMAP)
+    head = build_head(GSMAP, decoder=decoder)
+    full = build_head(GSMAP)
     for changed in (head, full):  # Gaussians that are not the first ones any more
         torch.nn.init.constant_(changed.reference.gaussian_init.bias, 0.5)
     layer = full.decoder.layers[0]
@@ -207,7 +230,9 @@ def test_parts_of_the_guided_layer_switch_off_by_themselves(part):
         torch.nn.init.constant_(layer.guidance.embedding[-1].bias, 0.5)
         assert head.decoder.layers[0].guidance.embedding is None
     assert isinstance(head.decoder.layers[0], GaussianDecoderLayer)
-    weights = {k: v for k, v in full.state_dict().items() if k in head.state_dict()}
+    weights = full.state_dict()
+    for name in weights.keys() - head.state_dict().keys():
+        del weights[name]
     head.load_state_dict(weights)
     assert not torch.equal(head(bev())[-1].scores, full(bev())[-1].scores)
 
@@ -228,13 +253,15 @@ def test_gaussians_of_the_queries_that_predict_are_returned():
 
 def test_the_log_says_how_the_gaussians_of_each_class_live():
     losses = losses_of(build_head(GSMAP), LANES)
-    figures = {name for name in losses if "loss" not in name}
-    kinds = ("soft_iou", "sigma_along", "sigma_across")
-    expected = {f"{kind}/{name}" for kind in kinds for name in ("divider", "boundary")}
-    assert figures == expected | {"at_floor"}
+    figures = losses.keys() - loss_names(losses)
+    expected = {"at_floor"}
+    for kind in ("soft_iou", "sigma_along", "sigma_across"):
+        expected |= {f"{kind}/divider", f"{kind}/boundary"}
+    assert figures == expected
     assert losses["sigma_along/divider"] == pytest.approx(1.0, abs=0.3)
     assert not losses["soft_iou/divider"].requires_grad
-    assert not {name for name in losses_of(build_head(GSMAP), EMPTY) if "loss" not in name}
+    without_truth = losses_of(build_head(GSMAP), EMPTY)
+    assert without_truth.keys() == loss_names(without_truth)
 
 
 def test_without_either_mask_nothing_is_drawn_or_rendered(monkeypatch):
@@ -242,19 +269,14 @@ def test_without_either_mask_nothing_is_drawn_or_rendered(monkeypatch):
     for maker in ("maptr.masks.draw_polylines", "gsmap.reference.render_gaussians"):
         monkeypatch.setattr(f"gsmap.models.{maker}", lambda *_: pytest.fail("a mask was made"))
     losses = losses_of(head, LANES)
-    assert set(losses) == {f"{p}loss_{n}" for p in ("", "d0.") for n in ("cls", "pts", "dir")}
+    names = {"loss_cls", "loss_pts", "loss_dir"}
+    assert set(losses) == names | {f"d0.{name}" for name in names}
 
 
 def test_the_smallest_gaussian_is_half_a_pixel_of_the_masks():
-    assert (
-        build_head(GSMAP, masks={"pixel_m": 0.3}, reference=None).reference.space.min_scale_m
-        == 0.15
-    )
-    assert (
-        build_head(GSMAP, masks={"pixel_m": 0.6}, reference=None).reference.space.min_scale_m == 0.3
-    )
-    oblong = build_head(GSMAP, masks={"pixel_m": (0.3, 0.5)}, reference=None)
-    assert oblong.reference.space.min_scale_m == 0.25
+    for pixel_m, smallest_m in ((0.3, 0.15), (0.6, 0.3), ((0.3, 0.5), 0.25)):
+        head = build_head(GSMAP, masks={"pixel_m": pixel_m}, reference=None)
+        assert head.reference.space.min_scale_m == smallest_m
     own = build_head(GSMAP, masks={"pixel_m": 0.3}, reference={"min_scale_m": 0.2})
     assert own.reference.space.min_scale_m == 0.2
     with pytest.raises(ValueError, match=r"min_scale_m < init_scales_m .* got 0.75, "):
@@ -265,7 +287,9 @@ def test_the_smallest_gaussian_is_half_a_pixel_of_the_masks():
 def test_any_range_has_a_first_gaussian_above_its_smallest(extent):
     x, y = extent
     grid = BEVGrid((-x / 2, x / 2), (-y / 2, y / 2))
-    config = {k: v for k, v in GSMAP.items() if k not in ("masks", "reference")}
-    space = build_head({**config, "grid": grid}).reference.space
+    config = {**GSMAP, "grid": grid}
+    config.pop("masks", None)
+    config.pop("reference", None)
+    space = build_head(config).reference.space
     assert space.min_scale_m == pytest.approx(y / 200 / 2)
     assert space.min_scale_m * 1.49 < min(space.init_scales_m)
