@@ -31,13 +31,20 @@ class Row:
 
 
 def _of_one_shape(deviation: Callable[..., float]) -> Callable[..., float]:
-    """Hand on both arrays in float64; the deviation is infinite where their shapes differ."""
+    """Pass both arrays in float64.
+
+    The deviation is infinite if their shapes differ. It is also infinite in place of NaN, which
+    Python's ``max`` over several deviations could drop.
+    """
 
     @wraps(deviation)
     def compare(ours: ArrayLike, reference: ArrayLike, *more: float) -> float:
-        ours, reference = np.asarray(ours, np.float64), np.asarray(reference, np.float64)
-        same = ours.shape == reference.shape
-        return float(deviation(ours, reference, *more)) if same else float("inf")
+        ours = np.asarray(ours, np.float64)
+        reference = np.asarray(reference, np.float64)
+        if ours.shape != reference.shape:
+            return float("inf")
+        value = float(deviation(ours, reference, *more))
+        return float("inf") if np.isnan(value) else value
 
     return compare
 
