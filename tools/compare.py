@@ -28,15 +28,9 @@ from typing import Any
 
 from comparison.jobs import execute
 from comparison.plan import Protocol, Run, parse_entry, plan
-from comparison.results import (
-    apply_rescoring,
-    as_json,
-    check_one_test_set,
-    markdown,
-    plot_iterations,
-    read_result,
-)
+from comparison.results import apply_rescoring, check_one_test_set, read_result
 from comparison.run_curves import plot_precision_recall
+from comparison.tables import as_json, markdown, plot_iterations
 
 from gsmap.engine.arguments import OverrideAction
 from gsmap.methods import METHODS

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 import upstream_configs
-from comparison.results import evaluator_for, markdown, read_result
+from comparison.results import evaluator_for, read_result
+from comparison.tables import markdown
 from processes import run_python
 
 from fuzz.attacks import CONFIG, PLANTED, config_corpus, corpus, plant, settings_corpus

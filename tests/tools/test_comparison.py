@@ -11,15 +11,8 @@ import pytest
 import torch
 from comparison.jobs import Job
 from comparison.plan import Protocol, Run, parse_entry, plan
-from comparison.results import (
-    as_json,
-    check_one_test_set,
-    differences_to_first,
-    evaluator_for,
-    markdown,
-    read_result,
-    rescore,
-)
+from comparison.results import check_one_test_set, evaluator_for, read_result, rescore
+from comparison.tables import as_json, differences_to_first, markdown
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.torchrun import OWN_WORDS

@@ -3,7 +3,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from comparison.results import plot_iterations
 from comparison.run_curves import (
     plot_precision_recall,
     plot_runs,
@@ -12,6 +11,7 @@ from comparison.run_curves import (
     smooth,
     summary_table,
 )
+from comparison.tables import plot_iterations
 
 from gsmap.evaluation import ChamferConfig, MapEvaluator
 from gsmap.structures.elements import MapElements
