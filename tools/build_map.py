@@ -221,7 +221,7 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
         package, extra = EXTRAS[key]
         import_extra(package, extra)
     origins = {name: find_origin(args, ann, name) for name in set(ann.column("map_name"))}
-    if args.crs and args.origin:
+    if args.crs is not None and args.origin:
         raise InputError("--crs and --origin both say where the poses lie: give one of them.")
     require_positions(ann, origins.values(), str(args.ann))
     maps_without_origin = []
@@ -307,7 +307,7 @@ def find_origin(
         ann: The samples.
         map_name: Name of the map of the samples. Its origin is known in nuScenes and Argoverse 2.
     """
-    if args.crs:
+    if args.crs is not None:
         return MapGrid(args.crs)
     if args.origin:
         latitude, longitude = args.origin

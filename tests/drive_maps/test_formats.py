@@ -323,6 +323,8 @@ def test_poses_in_a_grid_lie_where_the_grid_says():
         ("EPSG:2056", (2_600_000.0, 1_200_000.0), True),
         ("EPSG:2056", (10.0, -10.0), False),
         ("EPSG:3857", (10.0, 10.0), True),
+        ("EPSG:31468", (4_470_315.0, 5_329_181.0), True),
+        ("EPSG:25832+7837", (693_566.0, 5_330_684.0), True),
         ("EPSG:32650", (1e12, 0.0), False),
         ("EPSG:32650", (math.nan, 0.0), False),
     ],
@@ -337,3 +339,20 @@ def test_local_positions_are_no_coordinates_of_a_grid(crs, position, is_inside):
         ValueError, match=rf"a: the position .* outside of .*{crs}.*give its --orig"
     ):
         MapGrid(crs).require_inside(positions, "a")
+
+
+@pytest.mark.parametrize(
+    ("crs", "position", "message"),
+    [
+        ("EPSG:32632", (5_330_684.0, 693_566.0), "outside of .*x must be the easting"),
+        ("EPSG:31468", (5_329_181.0, 4_470_315.0), "outside of .*x must be the easting"),
+        ("EPSG:2056", (1_239_333.0, 2_680_270.0), "outside of .*x must be the easting"),
+        ("EPSG:3857", (1_291_306.0, 6_123_507.0), "differs by 50% .*such as its UTM zone"),
+        ("EPSG:3034", (4_115_192.0, 2_382_244.0), "differs by 3% .*such as its UTM zone"),
+    ],
+)
+def test_swapped_axes_and_stretched_grids_are_refused(crs, position, message):
+    """Munich and Zurich, with northing and easting exchanged, and in grids without true metres."""
+    pytest.importorskip("pyproj", reason="pip install -e .[maps]")
+    with pytest.raises(ValueError, match=message):
+        MapGrid(crs).require_inside(np.array([position]), "a")

@@ -13,6 +13,8 @@ from gsmap.utils.extras import import_extra
 
 # Largest absolute x and y of a map around an origin. Coordinates of a map grid are usually larger.
 _FARTHEST_M = 100_000.0
+_BEYOND_AREA_DEG = 5.0  # maps of a country leave the area of a grid by some degrees
+_MAX_STRETCH = 0.01  # largest difference of a metre of a grid from a metre on the ground
 
 
 @dataclass(frozen=True)
@@ -142,43 +144,58 @@ class MapGrid:
             )
 
     def require_inside(self, positions: FloatArray, where: str) -> None:
-        """Check that positions are coordinates of the grid.
+        """Check that positions are coordinates of the grid, in metres on the ground.
 
         Positions near the origin of the grid and outside of its area are probably metres from
-        another origin.
+        another origin. Other positions far outside of it are probably northings and eastings.
 
         Args:
             positions: Positions of the vehicle in the global frame. (n, >= 2)
             where: Name of the file, for the message.
 
         Raises:
-            ValueError: If a position has no longitude and latitude, or if it is outside of the area
-                of the grid. The area is not checked if a coordinate is larger than 100 km, because
-                metres from another origin are smaller.
+            ValueError: If a position has no longitude and latitude, if it is outside of the area of
+                the grid (by more than 5 degrees, if a coordinate is larger than 100 km), or if a
+                metre of the grid differs there by more than 1 percent from a metre on the ground,
+                as in Web Mercator.
         """
         points = np.asarray(positions)[:, :2]
-        system = import_extra("pyproj", "maps").CRS.from_user_input(self.crs)
+        pyproj = import_extra("pyproj", "maps")
+        system = pyproj.CRS.from_user_input(self.crs)
         lon_deg, lat_deg = self.lon_lat(points).T
         is_wrong = ~(np.isfinite(lon_deg) & np.isfinite(lat_deg))
         area = system.area_of_use  # bounds in degrees; None if the system has no known area
-        if area is not None and np.abs(points).max(initial=0.0) <= _FARTHEST_M:
+        if area is not None:
+            is_local = np.abs(points).max(initial=0.0) <= _FARTHEST_M
+            margin_deg = 0.0 if is_local else _BEYOND_AREA_DEG
             # Longitudes are measured eastward from the western bound, because an area may cross the
             # meridian of 180 degrees, where its eastern bound is smaller than its western bound.
             # pyproj returns infinity for a point without a longitude. Its remainder is NaN, without
             # a warning of numpy.
             with np.errstate(invalid="ignore"):
-                from_west_deg = (lon_deg - area.west) % 360.0
+                from_west_deg = (lon_deg - area.west + margin_deg) % 360.0
             width_deg = (area.east - area.west) % 360.0
             if width_deg == 0.0:  # the whole Earth
                 width_deg = 360.0
-            is_wrong |= from_west_deg > width_deg
-            is_wrong |= (lat_deg < area.south) | (lat_deg > area.north)
+            is_wrong |= from_west_deg > width_deg + 2 * margin_deg
+            is_wrong |= lat_deg < area.south - margin_deg
+            is_wrong |= lat_deg > area.north + margin_deg
         if is_wrong.any():
             x, y = points[is_wrong.argmax()]  # the first wrong position
             raise InputError(
                 f"{where}: the position {x:.0f} {y:.0f} is outside of the area of {self.crs} "
-                f"({system.name}): if positions are metres from a place, give its --origin LAT LON "
-                "instead of --crs."
+                f"({system.name}): x must be the easting and y the northing in this grid; if "
+                "positions are metres from a place, give its --origin LAT LON instead of --crs."
+            )
+        factors = pyproj.Proj(system).get_factors(lon_deg, lat_deg)
+        scales = np.stack([factors.meridional_scale, factors.parallel_scale])
+        stretch = np.abs(scales - 1.0).max(axis=0)
+        if stretch.max(initial=0.0) > _MAX_STRETCH:
+            x, y = points[stretch.argmax()]
+            raise InputError(
+                f"{where}: a metre of {self.crs} ({system.name}) differs by {stretch.max():.0%} "
+                f"from a metre on the ground at the position {x:.0f} {y:.0f}: transform the poses "
+                "to a grid of the place, such as its UTM zone."
             )
 
     @cached_property
