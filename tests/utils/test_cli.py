@@ -355,3 +355,10 @@ def test_a_word_that_is_given_twice_counts_once():
     parser.add_argument("--formats", nargs="+", action=EachOnce, default=["png"])
     assert parser.parse_args([]).formats == ["png"]
     assert parser.parse_args(["--formats", "osm", "png", "osm"]).formats == ["osm", "png"]
+
+
+@pytest.mark.parametrize("text", ["x" * 300, "a/" * 3000, "a\0b", "", "PROJCS[é" * 40])
+def test_a_text_of_any_length_is_an_argument(text):
+    parser = CommandParser()
+    parser.add_argument("--crs")
+    assert parser.parse_args(["--crs", text]).crs == text

@@ -29,7 +29,6 @@ from gsmap.utils.terminal import escape_output
 
 BAD_INPUT = 2  # exit code, as for bad arguments in argparse
 END_SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
-_LONGEST_PATH = 4096  # characters; PATH_MAX of Linux
 CLEAN_UP_S = 5.0  # time in which further signals are ignored
 RESEND_DELAY_S = 0.05  # delay before a lost signal is sent again
 
@@ -81,7 +80,8 @@ class CommandParser(argparse.ArgumentParser):
             for path in _paths_in(value):
                 if action.type is output_file:
                     outputs.append((path, str(option or action.dest)))
-                elif path.is_file():
+                # Unlike `Path.is_file`, this accepts every text, also one too long for a name.
+                elif os.path.isfile(path):
                     inputs.append(path)
         declare_files(inputs=inputs, outputs=outputs)
         # `run_command` blames an override for an error that the override causes.
@@ -127,7 +127,7 @@ def _paths_in(value: Any) -> Iterator[Path]:
     """Yield the paths in the value of an argument; every text may be a path."""
     if isinstance(value, Path):
         yield value
-    elif isinstance(value, str) and 0 < len(value) < _LONGEST_PATH and "\0" not in value:
+    elif isinstance(value, str):
         yield Path(value)
     elif isinstance(value, list | tuple):
         for item in value:
