@@ -173,7 +173,13 @@ def test_argoverse_infos_keep_three_coordinates(tmp_path):
         "token": "log_7",
         "annotation": {"divider": lines, "ped_crossing": [], "boundary": [], "centerline": lines},
     }
-    file = convert(tmp_path, "av2_map_infos_val.pkl", {"samples": [info]}, tmp_path)
+    unknown = info | {"token": "log_8", "annotation": None}
+    (tmp_path / "av2_val.pkl").write_bytes(pickle.dumps({"samples": [info, unknown]}))
+    summary = convert_infos(tmp_path / "av2_val.pkl", tmp_path / "a.arrow", tmp_path, "val")
+    size = "assumed to have 1550 x 2048 pixels"
+    assert summary.problems[f"ring_front_center: image not there ({size})"] == 2
+    assert summary.problems["no ground truth in the info file (sample kept without it)"] == 1
+    file = AnnotationFile(tmp_path / "a.arrow")
     sample = file[0]
     assert (file.meta.dataset, file.meta.frame, file.meta.dim) == ("av2", "ego", 3)
     assert (file.meta.x_range, file.meta.y_range) == ((-30, 30), (-15, 15))

@@ -107,23 +107,27 @@ def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstanc
 
 
 class _ImageSizes:
-    """Image sizes of a nuScenes info file, read once per scene and camera.
+    """Image sizes of an info file, read once per scene and camera.
 
     Args:
-        summary: Summary that counts missing images. The usual size in nuScenes is assumed for them.
+        summary: Summary that counts missing images. The usual size of the data set is assumed for
+            them.
     """
 
     def __init__(self, summary: ConversionSummary) -> None:
         self._summary = summary
         self._sizes: dict[tuple[str, str], tuple[int, int]] = {}
 
-    def __call__(self, scene: str, camera: str, file: Path) -> tuple[int, int]:
+    def __call__(
+        self, scene: str, camera: str, file: Path, usual: tuple[int, int]
+    ) -> tuple[int, int]:
         """Look up or read the size of a camera's images.
 
         Args:
             scene: Token of the scene.
             camera: Name of the camera.
             file: Image of the camera in this scene.
+            usual: Usual width and height of the camera's images in pixels.
 
         Returns:
             Width and height in pixels.
@@ -134,10 +138,10 @@ class _ImageSizes:
         if (scene, camera) in self._sizes:
             return self._sizes[scene, camera]
         if not file.is_file():
-            width, height = NUSCENES_SIZE
+            width, height = usual
             reason = f"image not there (assumed to have {width} x {height} pixels)"
             self._summary.add_problem(f"{camera}: {reason}", str(file))
-            return NUSCENES_SIZE  # not stored, as the next image of the camera may exist
+            return usual  # not stored, as the next image of the camera may exist
         size = image_size(file, f"camera {camera}")
         self._sizes[scene, camera] = size
         return size
@@ -157,7 +161,7 @@ def _nuscenes_sample(
         path = _relative(camera["data_path"], root)
         intrinsics = np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3]
         cam_from_frame = np.linalg.inv(pose_of(camera, "sensor2lidar_"))
-        width, height = image_sizes(scene, name, file=root / path)
+        width, height = image_sizes(scene, name, file=root / path, usual=NUSCENES_SIZE)
         record = CameraRecord(
             name=name,
             path=path,
@@ -202,7 +206,9 @@ def _nuscenes_sample(
     )
 
 
-def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
+def _argoverse_sample(
+    info: Mapping[str, Any], meta: AnnotationMeta, root: Path, image_sizes: _ImageSizes
+) -> MapSample:
     """Make a sample in the ego frame from an entry of an Argoverse 2 info file."""
     global_from_ego = pose_of(info, "e2g_")
     cameras = []
@@ -213,10 +219,8 @@ def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path)
         if "e2g_translation" in camera:
             global_from_ego_at_image = pose_of(camera, "e2g_")
         path = _relative(camera["img_fpath"], root)
-        # Usual size, for a missing image
-        width, height = _RING_FRONT_SIZE if name == "ring_front_center" else _RING_SIZE
-        if (root / path).is_file():
-            width, height = image_size(root / path, f"camera {name}")
+        usual = _RING_FRONT_SIZE if name == "ring_front_center" else _RING_SIZE
+        width, height = image_sizes(info["log_id"], name, file=root / path, usual=usual)
         intrinsics = np.asarray(camera["intrinsics"], np.float64)[:3, :3]
         cam_from_ego = np.asarray(camera["extrinsics"], np.float64)
         ego_at_image_from_global = np.linalg.inv(global_from_ego_at_image)
@@ -319,7 +323,7 @@ def _samples(
         # Errors about the content of the entry get its position and the remedy.
         with explain_errors(f"{infos}, sample {number}", remedy):
             if meta.frame == "ego":
-                sample = _argoverse_sample(info, meta, root=root)
+                sample = _argoverse_sample(info, meta, root=root, image_sizes=image_sizes)
             else:
                 sample = _nuscenes_sample(info, meta, root=root, image_sizes=image_sizes)
             check_samples([sample], meta)
@@ -337,6 +341,9 @@ def _samples(
             else:
                 reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
                 summary.add_problem(f"{reason} (sample kept without it)", sample.token)
+        else:
+            reason = "no ground truth in the info file (sample kept without it)"
+            summary.add_problem(reason, sample.token)
         summary.add_sample(meta.split, sample)
         yield sample
 
