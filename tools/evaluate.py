@@ -22,7 +22,6 @@ import gsmap  # noqa: F401
 import argparse
 import sys
 import time
-from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,6 +55,7 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import run_command
 from gsmap.utils.errors import InputError
+from gsmap.utils.extras import import_own
 from gsmap.utils.faults import suggestion
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import digest, digest_of_common, read_shard
@@ -146,7 +146,7 @@ def build_evaluator(args: argparse.Namespace, settings: MetricSettings) -> MapEv
         ValueError: If a metric is unknown, or no chosen metric can use one of the options.
     """
     for module in args.custom_imports:  # modules that register further metrics
-        import_module(module)
+        import_own(module)
     evaluator = MapEvaluator.from_names(args.eval, settings, args.gt_points)
     uses_min_score = any(metric.takes_min_score for metric in evaluator.metrics)
     if args.min_score is not None and not uses_min_score:

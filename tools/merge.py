@@ -6,7 +6,6 @@ metrics. Its N parts must lie in its folder. The joined file is identical to thi
 byte (docs/scale.md).
 """
 
-from importlib import import_module
 from pathlib import Path
 
 from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
@@ -18,6 +17,7 @@ from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.evaluation.core.results_json import merge_results
 from gsmap.utils.cli import CommandParser, EachOnce, output_file, run_command
 from gsmap.utils.errors import InputError
+from gsmap.utils.extras import import_own
 from gsmap.utils.shards import ShardFile, find_shards
 from gsmap.utils.words import format_count
 
@@ -63,7 +63,7 @@ def main(argv: list[str] | None = None) -> str:
     )
     args = parser.parse_args(argv)
     for module in args.custom_imports:
-        import_module(module)
+        import_own(module)
     lines = []
     for target in args.targets:
         shards = find_shards(target)  # raises an error if one is missing or differs from the others

@@ -72,7 +72,7 @@ infer: VAL --model C K --out out.json --cfg-options model.classes=[a] | K does n
 infer: VAL --model C K --out out.json --cfg-options test_dataloader.dataset.clas_ses=[a] | VectorizedMapDataset has no setting 'clas_ses'; did you mean 'classes'?
 infer: VAL --model C K --out out.json --cfg-options test_dataloader.dataset.classes=[a] | VAL was made with classes
 infer: VAL --model C K --out out.json --cfg-options test_dataloader.dataset.pipeline.9.type=x | --cfg-options of C cannot be used
-infer: VAL --model C K --out out.json --cfg-options custom_imports.imports=[nothing] | custom_imports of C cannot be used
+infer: VAL --model C K --out out.json --cfg-options custom_imports.imports=[nothing] | No module named 'nothing'; install it, or name its folder in PYTHONPATH.
 infer: VAL --model C K --out out.json --cfg-options visualizer.widht_px=3 | has no setting 'widht_px'; did you mean 'width_px'?
 train: nowhere.py | There is no config file nowhere.py
 train: C --work-dir plain.txt | plain.txt
@@ -120,6 +120,7 @@ browse_dataset: C --show-dir plain.txt | File exists: 'plain.txt'
 browse_dataset: C --cfg-options train_dataloader.dataset.pipeline.0.type=LoadCameraImage | there is no transform of type 'LoadCameraImage'; did you mean 'LoadCameraImages'?
 infer: VAL --model C K --out out.json --shard 2/2 | expected I/N with I from 0 to N - 1
 infer: VAL --model C K --out out.json --executor ray --shards 0 | --executor needs --shards N
+evaluate: nothing.json VAL --custom-imports mine | mine cannot be imported: No module named 'mine'; install it, or name its folder in PYTHONPATH.
 evaluate: nothing.json VAL --shard 0/2 | --shard needs --out
 evaluate: nothing.json VAL --shard / --out out.json | expected I/N with I from 0 to N - 1
 evaluate: nowhere.json VAL | No such file or directory: 'nowhere.json'; check the path.

@@ -12,6 +12,7 @@ from mmengine.config import Config
 from mmengine.registry import Registry, build_from_cfg
 
 from gsmap.utils.errors import GsmapError, InputError
+from gsmap.utils.extras import NOT_INSTALLED
 from gsmap.utils.faults import registry_names, suggestion, user_message
 from gsmap.utils.overrides import find_override
 from gsmap.utils.shipped import shipped_path
@@ -76,8 +77,9 @@ def reading_config(source: object) -> Iterator[None]:
                 f"'gsmap::' is not read in _base_; write a path below {shipped_path('configs')} "
                 "instead"
             )
+        advice = f"; {NOT_INSTALLED}" if isinstance(reason, ModuleNotFoundError) else ""
         raise InputError(
-            f"{source}{place} cannot be used: {type(reason).__name__}: {reason}."
+            f"{source}{place} cannot be used: {type(reason).__name__}: {reason}{advice}."
         ) from error
 
 
