@@ -57,6 +57,29 @@ def test_runs_are_planned_with_one_budget_seed_by_seed(tiny_config, protocol):
 
 
 @pytest.mark.parametrize(
+    ("evaluator", "option"),
+    [
+        ("dict(type='MapMetric')", "val_evaluator.eval"),
+        ("[dict(type='LyftMetric'), dict(type='MapMetric')]", "val_evaluator.1.eval"),
+        ("dict(_delete_=True, metrics=[dict(type='MapMetric')])", "val_evaluator.metrics.0.eval"),
+        ("dict(_delete_=True, metrics=dict(type='MapMetric'))", "val_evaluator.metrics.eval"),
+    ],
+)
+def test_a_validation_may_have_further_metrics(evaluator, option, tiny_config, protocol, tmp_path):
+    leaf = tmp_path / "leaf.py"
+    leaf.write_text(f"_base_ = '{tiny_config}'\nval_evaluator = {evaluator}\n")
+    run, *_ = plan(entries(leaf, "a=CONFIG"), protocol)
+    assert run.options[1] == f"{option}=chamfer,raster"
+
+
+def test_a_validation_without_figures_to_compare_is_refused(tiny_config, protocol, tmp_path):
+    leaf = tmp_path / "leaf.py"
+    leaf.write_text(f"_base_ = '{tiny_config}'\nval_evaluator = [dict(type='LyftMetric')]\n")
+    with pytest.raises(ValueError, match=r"leaf\.py: val_evaluator has no MapMetric"):
+        plan(entries(leaf, "a=CONFIG"), protocol)
+
+
+@pytest.mark.parametrize(
     ("texts", "message"),
     [
         (["a=CONFIG", "a=CONFIG"], "two configs have one name"),

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from mmdet3d.registry import DATASETS, MODELS
+from mmdet3d.registry import DATASETS, METRICS, MODELS
 from mmengine.config import Config
 
 from gsmap.checkpoints.building import building
@@ -27,7 +27,9 @@ from gsmap.checkpoints.settings import differences, plain, single_dataset_of
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, find_schedulers, read_config
+from gsmap.engine.targets import class_of_type
 from gsmap.evaluation.core.evaluator import METRIC_NAMES
+from gsmap.evaluation.map_metric import MapMetric
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
@@ -277,21 +279,42 @@ def _processes(protocol: Protocol) -> int:
     return 1
 
 
+def _map_metric(cfg: Config) -> str:
+    """Dotted name of the settings of `MapMetric` in the validation, which may have other metrics.
+
+    Raises:
+        ValueError: If the validation has a list of metrics without a `MapMetric`.
+    """
+    name = "val_evaluator"
+    metrics = cfg.get(name)
+    if isinstance(metrics, Mapping) and "metrics" in metrics:
+        name = "val_evaluator.metrics"
+        metrics = metrics["metrics"]
+    if not isinstance(metrics, list):
+        return name
+    for number, metric in enumerate(metrics):
+        if issubclass(class_of_type(metric.get("type"), METRICS) or object, MapMetric):
+            return f"{name}.{number}"
+    raise InputError(
+        f"{cfg.filename}: {name} has no MapMetric, whose figures are compared: add it."
+    )
+
+
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
     """Plan one run. Its data set and its model are built once, so that faults are found early."""
     initial_weights = None
     # Overrides of the comparison. Overrides of the user come after them and take precedence.
     comparison_options = [
         f"train_dataloader.batch_size={protocol.batch // processes}",
-        "val_evaluator.eval=chamfer,raster",
         f"randomness.seed={seed}",
     ]
     if protocol.init is not None:
         initial_weights = find_checkpoint(protocol.init).resolve()
         comparison_options.append(f"load_from={initial_weights}")
     user_options = (*entry.options, *protocol.options)
-    # The config is read twice: the overrides added below depend on the data set and the schedule.
+    # The config is read twice: the overrides added below depend on its metrics, data and schedule.
     cfg = read_config(entry.config, parse_options([*comparison_options, *user_options]))
+    comparison_options.insert(1, f"{_map_metric(cfg)}.eval=chamfer,raster")
     epochs = _count_epochs(entry, cfg, protocol=protocol, processes=processes)
     comparison_options.append(f"train_cfg.max_epochs={epochs}")
     comparison_options.append(f"train_cfg.val_interval={max(1, epochs // 4)}")
