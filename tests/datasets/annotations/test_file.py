@@ -100,7 +100,7 @@ def test_pickle_hands_on_the_path_and_checksums_alone(tmp_path: Path):
         ({"lidar": LidarRecord("../a.bin", np.eye(4))}, r"LiDAR path must be .*got '../a.bin'"),
         ({"lidar": LidarRecord("a", np.eye(4), [SweepRecord("/b", 0, np.eye(4))])}, "got '/b'"),
         ({"timestamp_ns": 2**70}, "'token7' to 'token0'"),
-        ({"scene": 5}, "'token7' to 'token0'"),
+        ({"scene": 5}, "sample 'token0': scene must be text, got 5"),
         (
             {"cameras": [CameraRecord("A", "x", 0, 1, INTRINSICS, np.eye(4))]},
             "size is not positive",

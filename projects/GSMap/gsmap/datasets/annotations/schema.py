@@ -37,6 +37,7 @@ _SHAPES = {
     "frame_from_lidar": (4, 4),
 }
 _INTEGERS = {"timestamp_ns", "width", "height", "label"}  # fields that are converted to int
+_TEXTS = {"token", "scene", "map_name", "name", "path"}
 _CAMERA = pa.struct(
     {
         "name": pa.string(),
@@ -93,7 +94,8 @@ def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]
         Values by the name of the column. Matrices and points are flat arrays.
 
     Raises:
-        ValueError: If a matrix or the points of an element have a wrong shape or are not numeric.
+        ValueError: If a matrix or the points of an element have a wrong shape or are not numeric,
+            or a name, token or path is no text.
     """
     if isinstance(record, MapSample):
         where += f"sample {record.token!r}: "
@@ -110,6 +112,8 @@ def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]
             value = [row_of(item, meta, where=where) for item in value]
         elif isinstance(value, LidarRecord):
             value = row_of(value, meta, where=where)
+        elif name in _TEXTS and not isinstance(value, str | bytes | None):
+            raise InputError(f"{where}{name} must be text, got {value!r:.80}.")
         row[name] = int(value) if name in _INTEGERS else value
     return row
 
