@@ -146,6 +146,9 @@ def test_lidar_and_signals_are_kept(tmp_path: Path):
         (record(instances=[{"label": "tree", "points": [[0, 0], [1, 1]]}]), "'tree' is not among"),
         (record(instances=[{"label": 0, "points": [[0, 0, 0], [1, 1, 1]]}]), r"\(n >= 2, 2\)"),
         (record(instances=[{"label": 0, "points": [[0, np.nan], [1, 1]]}]), "NaN"),
+        ({**record(), "token": 5}, "sample 5: token must be text, got 5"),
+        (record(scene=7), "sample 't': scene must be text, got 7"),
+        (record(lidar={"path": Path("l.bin")}), "sample 't': path must be text, got PosixPath"),
         (
             record(instances=[{"label": 1, "points": [[0, 0], [40, 9], [40, 0], [0, 9], [0, 0]]}]),
             "crosses itself",
@@ -156,6 +159,17 @@ def test_mistakes_are_named_and_leave_nothing(tmp_path: Path, bad: dict, message
     with pytest.raises(ValueError, match=message):
         from_records(tmp_path / "a.arrow", [bad], META, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_areas_that_are_open_lines_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    ring = [[8, -4], [11, -4], [11, 4], [8, 4]]
+    elements(tmp_path, {"label": 1, "points": [*ring, ring[0]]}, {"label": 0, "points": ring})
+    assert "open lines" not in caplog.text
+    elements(tmp_path, {"label": 1, "points": ring})
+    assert (
+        "1 of 1 records have crossings or other areas that are open lines (the first is 't')"
+        in (caplog.text)
+    )
 
 
 def test_a_missing_or_broken_image_is_named(tmp_path: Path):

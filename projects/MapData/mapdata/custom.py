@@ -21,7 +21,7 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size, read_image
-from gsmap.structures.classes import LINE_CLASSES
+from gsmap.structures.classes import AREA_CLASSES, LINE_CLASSES
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.errors import InputError
@@ -49,6 +49,11 @@ _UNKNOWN_ROAD = (
 _ALL_ELEMENTS_LOST = (
     "%d of %d records lose all of their elements (the first is %r), as none lies in x_range and "
     "y_range: points must be in metres of the frame, not of the world, and not in millimetres."
+)
+# Placeholders: number of records with open areas, number of records, first token.
+_OPEN_AREAS = (
+    "%d of %d records have crossings or other areas that are open lines (the first is %r): close "
+    "a ring by repeating its first point at the end."
 )
 _COPY_M = 0.01  # largest distance of two copies of a line
 _SAME_PLACE_M = 0.1  # ends of lines within this distance are one place
@@ -152,6 +157,7 @@ def create_samples(
     """
     has_warned = False
     empty_tokens = []
+    open_tokens = []
     count = 0
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
@@ -161,6 +167,8 @@ def create_samples(
             check_samples([sample], meta)  # raises an error for a wrong shape or value
             count += 1
             had_elements = bool(sample.instances)
+            if any(_is_open_area(element, meta) for element in sample.instances or []):
+                open_tokens.append(sample.token)
             if sample.instances is not None:
                 sample.instances = _clip_elements(sample.instances, meta=meta, join=join)
         if had_elements and not sample.instances:
@@ -173,6 +181,14 @@ def create_samples(
         yield sample
     if empty_tokens:
         _LOGGER.warning(_ALL_ELEMENTS_LOST, len(empty_tokens), count, empty_tokens[0])
+    if open_tokens:
+        _LOGGER.warning(_OPEN_AREAS, len(open_tokens), count, open_tokens[0])
+
+
+def _is_open_area(element: MapInstance, meta: AnnotationMeta) -> bool:
+    """Whether an element of a class of areas is no closed ring."""
+    is_area = meta.classes[element.label] in AREA_CLASSES
+    return is_area and not is_closed(np.asarray(element.points))
 
 
 def _clip_elements(
