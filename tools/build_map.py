@@ -59,6 +59,7 @@ from gsmap.visualization.style import MapStyle
 FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
 _LON_LAT = "_lonlat"  # ending of the names of GeoJSON files in degrees; other ones are in metres
 _SCORES = "scores.json"
+_NEAR_M = 1000.0  # an earlier map of a place lies at least in part this near to its samples
 _CHANGES = "changes"  # name of the file of changes, without a suffix
 # Bytes that every output of this command contains. A file without them belongs to another program.
 _MARK = b"gsmap"  # in maps
@@ -454,7 +455,7 @@ def place_of(ann: AnnotationFile, scenes: Iterable[str]) -> str:
 
 
 def open_map(path: Path, args: argparse.Namespace, ann: AnnotationFile, place: str) -> MapElements:
-    """Read an earlier map, and print the number of elements that are not used.
+    """Read an earlier map, and print the number of elements that are not used, or lie elsewhere.
 
     Args:
         path: GeoJSON or Lanelet2 file.
@@ -468,7 +469,23 @@ def open_map(path: Path, args: argparse.Namespace, ann: AnnotationFile, place: s
     print(f"{format_count(len(file.elements), 'element')}: {path}")
     if file.unused:
         print(f"not used: {describe_unused(file.unused)}")
+    if not lies_near(file.elements, ann, place):
+        print(
+            f"{path} has no element within {_NEAR_M:g} m of the samples of {args.ann}: its "
+            "coordinates may be of another frame."
+        )
     return file.elements
+
+
+def lies_near(elements: MapElements, ann: AnnotationFile, place: str) -> bool:
+    """Whether the bounding box of an element is within 1 km of the samples of a place."""
+    positions = [sample.global_from_frame[:2, 3] for sample in ann if sample.map_name == place]
+    low = np.min(positions, axis=0) - _NEAR_M
+    high = np.max(positions, axis=0) + _NEAR_M
+    for line in elements.polylines:
+        if (line.min(axis=0) <= high).all() and (line.max(axis=0) >= low).all():
+            return True
+    return False
 
 
 def compare(

@@ -320,7 +320,13 @@ def test_a_prior_is_made_of_maps_of_other_programs(files, tmp_path, capsys):
         prior = tmp_path / "town.prior"
         main(["--map", str(tmp_path / name), "--ann", str(ann), "--prior", str(prior), *options])
         assert_street(read_prior(prior, "town"))
-    assert "not used: 1 x kind 'tree'\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "not used: 1 x kind 'tree'\n" in printed
+    assert "no element within" not in printed
+    elsewhere = ["--origin", "48.36", "11.67"]  # 11 km to the north
+    words = ["--map", str(tmp_path / name), "--ann", str(ann), "--prior", str(prior)]
+    main([*words, *rule, *elsewhere])
+    assert f"{name} has no element within 1000 m of the samples of {ann}" in capsys.readouterr().out
 
 
 def test_changes_since_an_old_map_are_written(files, tmp_path, capsys):
