@@ -628,7 +628,8 @@ def group_scenes(
 def read_results(args: argparse.Namespace, ann: AnnotationFile) -> dict[str, MapElements]:
     """Read the predictions in the annotation frames of the samples, by token.
 
-    Predictions of classes that the annotation file lacks are left out and printed.
+    Predictions of classes that the annotation file lacks are left out. These, short predictions
+    and samples that one file lacks are printed.
 
     Raises:
         ValueError: If the file is malformed, or if maps are scored and the model was trained on
@@ -641,6 +642,19 @@ def read_results(args: argparse.Namespace, ann: AnnotationFile) -> dict[str, Map
     for name, number in sorted(file.ignored.items()):
         if name != THREE_D:
             print(f"not used: {format_count(number, 'prediction')} of class {name!r}")
+    if file.num_short:
+        print(f"not used: {format_count(file.num_short, 'prediction')} of fewer than two points")
+    scene_of = dict(zip(ann.column("token"), ann.column("scene"), strict=True))
+    missing = []
+    for token, scene in scene_of.items():
+        if token not in results and scene in (args.scene or [scene]):
+            missing.append(token)
+    if missing:
+        number = format_count(len(missing), "sample")
+        print(f"not used: {number} without results, such as {missing[0]!r}")
+    if others := [token for token in results if token not in scene_of]:
+        number = format_count(len(others), "result")
+        print(f"not used: {number} of samples that {args.ann} lacks, such as {others[0]!r}")
     if has_truth(ann) and not args.allow_other_split:  # maps are scored
         require_results_of(ann.meta.split_list, file.about, args.results)
     return results

@@ -61,15 +61,32 @@ def test_predictions_of_other_classes_are_left_out_and_counted(files, tmp_path, 
     content = json.loads(results.read_text())
     for sample in content["results"]:
         sample["vectors"].append({**sample["vectors"][0], "cls_name": "kerb"})
+    content["results"].append({"sample_token": "elsewhere", "vectors": []})
+    short = {"cls_name": CLASSES[0], "pts": [[0, 0]], "confidence_level": 0.9}
+    content["results"][0]["vectors"].append(short)
     (tmp_path / "more.json").write_text(json.dumps(content))
     for name, given in (("plain", results), ("more", tmp_path / "more.json")):
         main([str(given), "--ann", str(ann), "--out", str(tmp_path / name)])
-        note = f"not used: {len(content['results'])} predictions of class 'kerb'"
-        assert (note in capsys.readouterr().out) == (name == "more")
+        text = capsys.readouterr().out
+        for note in (
+            f"not used: {len(content['results']) - 1} predictions of class 'kerb'\n",
+            "not used: 1 prediction of fewer than two points\n",
+            f"not used: 1 result of samples that {ann} lacks, such as 'elsewhere'\n",
+        ):
+            assert (note in text) == (name == "more")
     for name in ("scores.json", "scene.geojson"):
         assert (tmp_path / "plain" / name).read_bytes() == (tmp_path / "more" / name).read_bytes()
     prior = ["--prior", str(tmp_path / "street.gsmap-prior"), "--gaussians"]
     main([str(tmp_path / "more.json"), "--ann", str(ann), *prior])
+
+
+def test_samples_without_results_are_left_out_and_counted(files, tmp_path, capsys):
+    content = json.loads(files[0].read_text())
+    gone = content["results"].pop(3)["sample_token"]
+    (tmp_path / "fewer.json").write_text(json.dumps(content))
+    main([str(tmp_path / "fewer.json"), "--ann", str(files[1]), "--out", str(tmp_path)])
+    said = f"not used: 1 sample without results, such as {gone!r}\n"
+    assert said in capsys.readouterr().out
 
 
 def test_drives_of_a_place_are_joined_into_one_map(files, tmp_path, capsys):
@@ -164,7 +181,7 @@ def test_samples_without_poses_have_no_map_but_a_film(files, tmp_path):
 
 def test_results_of_other_samples_are_refused(files, tmp_path):
     write_results(tmp_path / "other.json", [("somewhere", [])])
-    with pytest.raises(ValueError, match=r"no sample of scene 'scene' has results"):
+    with pytest.raises(ValueError, match=r"no sample of scene 'scene' has results.* --scene"):
         main([str(tmp_path / "other.json"), "--ann", str(files[1]), "--out", str(tmp_path)])
 
 

@@ -67,13 +67,16 @@ def test_results_of_other_samples_are_refused(annotations, tmp_path):
 
 def test_what_is_left_out_is_named(annotations, tmp_path):
     tree = {"cls_name": "tree", "pts": [[0, 0], [1, 1]], "confidence_level": 0.5}
-    samples = [{"sample_token": "a", "vectors": [tree]}, {"sample_token": "b", "vectors": []}]
+    short = {"cls_name": "divider", "pts": [[5, 0]], "confidence_level": 0.5}
+    one = {"sample_token": "a", "vectors": [tree, short]}
+    samples = [one, {"sample_token": "b", "vectors": []}]
     results = tmp_path / "results.json"
     results.write_text(json.dumps({"results": samples}))
     _, notes = write_fiftyone(tmp_path / "out.json", annotations, results=results)
     assert notes == [
         "1 result has no ground truth, such as 'b': left out",
         "1 predictions of class 'tree' are left out",
+        "1 prediction of fewer than two points left out",
     ]
 
 

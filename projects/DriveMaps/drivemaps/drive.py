@@ -219,7 +219,8 @@ def read_drive(
     for scene, samples_of_one in samples_of_scene.items():
         if not samples_of_one:
             raise InputError(
-                f"no sample of scene {scene!r} has results: give the results of {annotations.path}."
+                f"no sample of scene {scene!r} has results: give the results of "
+                f"{annotations.path}, or choose other drives with --scene."
             )
         samples += samples_of_one
     samples.sort(key=lambda sample: sample.timestamp_ns)

@@ -249,13 +249,18 @@ def test_without_results_the_page_shows_ground_truth(case):
 def test_results_of_other_samples_are_an_error_unless_allowed(case, tmp_path):
     other = tmp_path / "other.json"
     strange = {"cls_name": "kerb", "pts": [[0, 0], [1, 0]], "confidence_level": 0.5}
-    other.write_text(json.dumps({"results": [{"sample_token": "t0", "vectors": [strange]}]}))
+    short = {"cls_name": CLASSES[0], "pts": [[0, 0]], "confidence_level": 0.5}
+    vectors = [strange, short]
+    other.write_text(json.dumps({"results": [{"sample_token": "t0", "vectors": vectors}]}))
     with pytest.raises(ValueError, match=r"other\.json: 5 samples have no results"):
         page_data(case[0], {"other": other}, NO_IMAGES)
     allowed = page_data(case[0], {"other": other}, replace(NO_IMAGES, allow_mismatch=True))
     assert allowed["frames"][3]["found"] == [[]]
     assert "5 samples have no results" in allowed["notes"][0]
-    assert allowed["notes"][1] == "other: 1 predictions of class 'kerb' are not scored"
+    assert allowed["notes"][1:] == [
+        "other: 1 prediction of fewer than two points left out",
+        "other: 1 predictions of class 'kerb' are not scored",
+    ]
 
 
 @pytest.mark.parametrize("wrong", [{"max_frames": 0}, {"score_thr": 1.2}, {"image_width": -1}])

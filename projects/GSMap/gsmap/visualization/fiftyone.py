@@ -69,6 +69,9 @@ def write_fiftyone(
         for name, number in sorted(predictions.ignored.items()):
             if name != THREE_D:
                 notes.append(f"{number} predictions of class {name!r} are left out")
+        if predictions.num_short:
+            count = format_count(predictions.num_short, "prediction")
+            notes.append(f"{count} of fewer than two points left out")
         if not places.keys() & set(file.column("token")):
             raise InputError(f"{results} has no sample of {annotations}.")
     # Orientation of the annotation frame, and the ground, on which lines without z are drawn.

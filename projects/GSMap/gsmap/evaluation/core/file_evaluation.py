@@ -253,9 +253,7 @@ class SamplePairs:
             if isinstance(self._truth, SampleFile):  # `AnnotatedTruth` has the part itself
                 self._truth.left_out = self._results.left_out
         self._mismatches: list[str] = []
-        # numbers of predictions and of ground truths of fewer than two points
-        self._short_predictions = 0
-        self._short_truths = 0
+        self._short_truths = 0  # number of ground truths of fewer than two points
         # Smallest and largest x and y of the ground truth in metres.
         self._low = np.full(2, np.inf)
         self._high = np.full(2, -np.inf)
@@ -314,8 +312,7 @@ class SamplePairs:
         return self._results.about
 
     def _pair(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
-        """Create a sample, and update the counts of elements without a line and the bounds."""
-        self._short_predictions += int((predictions.num_points < 2).sum())
+        """Create a sample, and update the count of ground truths without a line and the bounds."""
         self._short_truths += int((truth.num_points < 2).sum())
         if len(truth.points):
             points = np.asarray(truth.points)[:, :2]
@@ -340,9 +337,9 @@ class SamplePairs:
         if num_with_heights and not counts_heights:
             text = "some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)"
             notes.append((0, text))
-        if self._short_predictions:
+        if self._results.num_short:
             text = "predictions have fewer than two points: they are left out"
-            notes.append((self._short_predictions, text))
+            notes.append((self._results.num_short, text))
         if self._short_truths:
             text = (
                 "ground truths have fewer than two points: they count, but no prediction can match "

@@ -77,6 +77,7 @@ class SampleFile:
         left_out: Tokens of samples that iterating leaves out, such as those of other shards.
         ignored: Number of elements of each other class, and number of samples with heights
             (``THREE_D``), in the samples yielded so far.
+        num_short: Number of elements of fewer than two points in these samples.
         about: Metadata of the file. It is set after the last sample was read, and not validated.
     """
 
@@ -89,6 +90,7 @@ class SampleFile:
         self._gaussians = gaussians
         self.left_out: Collection[str] = frozenset()
         self.ignored = Counter[str]()
+        self.num_short = 0
         self.about: dict[str, Any] = {}
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, Place]]:
@@ -118,6 +120,7 @@ class SampleFile:
             tokens.add(token)
             if token not in self.left_out:
                 elements = self._elements_of(item, self.ignored)
+                self.num_short += int((elements.num_points < 2).sum())
                 yield item, token, elements, place
         meta = other_entries["meta"]
         self.about = meta if isinstance(meta, dict) else {}

@@ -21,6 +21,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import law_of
 from gsmap.utils.split_lists import require_results_of
+from gsmap.utils.words import format_count
 
 MATCH_M = 1.0
 """Largest Chamfer distance in metres of a hit on the page."""
@@ -125,6 +126,9 @@ def score_result(
     num_samples_with_heights = num_ignored.pop(THREE_D, 0)
     if num_samples_with_heights:
         notes.append("some predictions have heights, which no figure here counts")
+    if file.num_short:
+        few = "of fewer than two points"
+        notes.append(f"{format_count(file.num_short, 'prediction')} {few} left out")
     for class_name, count in sorted(num_ignored.items()):
         notes.append(f"{count} predictions of class {class_name!r} are not scored")
     evaluator = _create_evaluator(meta)
