@@ -8,6 +8,11 @@ from pathlib import Path
 
 import cv2
 import pytest
+from mmdet3d.registry import MODELS
+from mmengine.config import Config
+from mmengine.registry import init_default_scope
+
+import gsmap.registered  # noqa: F401
 
 REPO = Path(__file__).resolve().parents[2]
 SMALL = """
@@ -64,3 +69,21 @@ def test_own_data_with_one_camera_train_test_and_infer(my_data, tmp_path, monkey
         "queries of 50 x 25 BEV cells interpolated to 25 x 50.",
     } <= set(said)
     assert sum(line.startswith("frame was lidar, is ego: ") for line in said) == 1
+
+
+@pytest.mark.parametrize(("ahead", "left"), [(50.0, 25.0), (100.0, 50.0), (20.0, 15.65)])
+def test_the_template_takes_any_range(tmp_path, ahead, left):
+    template = (REPO / "configs/my_data.py").read_text().replace("'./", f"'{REPO}/configs/")
+    ranges = f"x_range=[-{ahead}, {ahead}], y_range=[-{left}, {left}]"
+    edited = template.replace("x_range=[-30.0, 30.0], y_range=[-15.0, 15.0]", ranges)
+    assert edited != template
+    (tmp_path / "my_city.py").write_text(edited)
+    config = Config.fromfile(tmp_path / "my_city.py")
+    init_default_scope("mmdet3d")
+    model = MODELS.build(config.model)
+    grid = model.bev_encoder.grid
+    sides = 2 * ahead / grid.width, 2 * left / grid.height
+    assert sides == pytest.approx((1.2, 1.2), rel=0.03)  # metres, near the trained size
+    steps = config.train_dataloader.dataset.pipeline
+    (mask,) = [step for step in steps if step.type == "MakeBEVMask"]
+    assert mask["size"] == [grid.height, grid.width]
