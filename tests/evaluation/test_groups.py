@@ -8,6 +8,7 @@ from test_files import annotated, command, results_of
 
 from gsmap.evaluation.analysis.groups import Groups, ap_by_group, group_table, read_groups
 from gsmap.evaluation.core.results_json import write_results
+from gsmap.utils.words import markdown_table
 
 SCENES = [
     {"name": "s0", "description": "Night, rain, parked cars"},
@@ -74,6 +75,10 @@ def test_a_file_without_a_group_for_each_scene_is_refused(content, message, tmp_
         read_groups(tmp_path / "truth.json", "scene")
     with pytest.raises(ValueError, match="the group of sample 't1' is not known"):
         Groups({"t0": "a"}).draw_copies(["t0", "t1"])
+
+
+def test_a_separator_in_the_name_of_a_group_is_escaped():
+    assert markdown_table(["a|b"], [["c"]]) == "| a\\|b |\n| --- |\n| c |"
 
 
 def test_the_command_prints_and_writes_the_ap_of_each_group(tmp_path, capsys):

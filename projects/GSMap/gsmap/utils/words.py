@@ -21,5 +21,6 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     rule = ["---"] * len(head)
     lines = []
     for cells in (head, rule, *rows):
-        lines.append(f"| {' | '.join(cells)} |")
+        escaped = [cell.replace("|", r"\|") for cell in cells]  # names may contain the separator
+        lines.append(f"| {' | '.join(escaped)} |")
     return "\n".join(lines)
