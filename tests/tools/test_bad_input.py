@@ -137,7 +137,7 @@ evaluate: nothing.json VAL --out . | Is a directory
 evaluate: nothing.json VAL --bootstrap 1 | intervals need two scenes, two resamples
 evaluate: nothing.json nothing.json --against nothing.json | no list under 'GTs'
 evaluate: nothing.json VAL --shard 0/2 --out o.json --bootstrap | --bootstrap needs all samples: leave out --shard
-evaluate: nothing.json VAL --by weather | --by takes scene, map or a JSON file
+evaluate: nothing.json VAL --by weather | --by takes scene, map, distance or a file
 evaluate: VAL --prior nowhere.arrow | no annotation file at nowhere.arrow
 report: damaged.json --ann VAL | damaged.json is empty or holds no complete list
 report: nothing.json --ann VAL | nothing.json: 2 samples have no results

@@ -243,7 +243,8 @@ def test_without_results_the_page_shows_ground_truth(case):
     data = page_data(case[0], {}, replace(NO_IMAGES, max_frames=2))
     assert data["title"] == "case val: ground truth"
     assert data["tables"] == data["curves"] == data["frames"][0]["found"] == []
-    assert data["notes"] == ["The page shows 2 of 6 frames: evenly spread."]
+    notes = page_data(*case, replace(NO_IMAGES, max_frames=2))["notes"]  # too few for worst ones
+    assert data["notes"] == notes[-1:] == ["The page shows 2 of 6 frames: evenly spread."]
 
 
 def test_results_of_other_samples_are_an_error_unless_allowed(case, tmp_path):

@@ -86,7 +86,7 @@ def _read_frames(
     if missing:
         raise InputError(
             f"{results} has no sample {missing[0]!r} ({len(missing)} are missing): consistency "
-            "needs whole drives."
+            "and films need whole drives."
         )
     scenes = annotations.column("scene")
     times = annotations.column("timestamp_ns")

@@ -85,7 +85,7 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
         raise InputError(f"{annotations} knows no scenes: give the annotation file (.arrow).")
     if by not in _COLUMNS and not Path(by).is_file():
         raise FileNotFoundError(
-            f"--by takes {', '.join(_COLUMNS)} or a JSON file, and there is no file {by!r}."
+            f"--by takes {', '.join(_COLUMNS)}, distance or a file, and there is no file {by!r}."
         )
     file = AnnotationFile(annotations)
     if Path(by).suffix.lower() == CHANGES_SUFFIX:

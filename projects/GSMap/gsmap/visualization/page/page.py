@@ -263,6 +263,8 @@ def _describe_choice(scored: Sequence[ScoredResult], num_chosen: int, max_frames
     if not scored:
         return "evenly spread"
     num_worst = max_frames // 4  # as in `choose_frames`
+    if not num_worst:
+        return "evenly spread"
     worst = f"the {num_worst} worst of {scored[0].name}"
     if len(scored) == 2:
         worst = f"{num_worst} in which both results differ most"
