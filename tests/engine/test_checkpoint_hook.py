@@ -1,5 +1,6 @@
 import os
 import pickle
+import random
 import signal
 import subprocess
 import sys
@@ -199,16 +200,25 @@ def listed(split_list: str, count: int = 1) -> Listed:
 
 
 def learn(
-    work_dir, epochs, resume_from=None, train=None, val=None, schedule=None, lr=0.1, **options
+    work_dir,
+    epochs,
+    resume_from=None,
+    train=None,
+    val=None,
+    schedule=None,
+    lr=0.1,
+    model=Learner,
+    loader=None,
+    **options,
 ) -> int:
     """Train for some epochs, with a validation after every second and the last; return how many."""
     Learner.validations = 0
     before = torch.serialization.get_safe_globals()
     data = [{"inputs": torch.ones(1)}] * 2
     runner = MapRunner(
-        Learner(),
+        model(),
         str(work_dir),
-        train_dataloader=torch.utils.data.DataLoader(train or data),
+        train_dataloader=torch.utils.data.DataLoader(train or data, **(loader or {})),
         val_dataloader=torch.utils.data.DataLoader(val or data[:1]),
         train_cfg={"by_epoch": True, "max_epochs": epochs, "val_interval": 2},
         val_cfg={},
@@ -325,6 +335,66 @@ def test_weights_alone_cannot_be_resumed_from(tmp_path):
     torch.save({"weight": torch.ones(1)}, tmp_path / "bare.pth")
     with pytest.raises(ValueError, match=r"bare.pth cannot be resumed from: it holds weights and"):
         learn(tmp_path, 2, tmp_path / "bare.pth")
+
+
+class Noisy(Learner):
+    """A learner with random numbers of all libraries in its loss, as dropout has them."""
+
+    def forward(self, inputs, data_samples=None, mode="tensor"):
+        noise = random.gauss(1, 0.1) + np.random.normal() + torch.rand(())  # noqa: NPY002
+        return {"loss": noise * (self.weight**2).sum()}
+
+
+@pytest.mark.parametrize("loader", [{}, {"num_workers": 1, "persistent_workers": True}])
+@pytest.mark.parametrize("options", [{}, {"save_best": "figure", "rule": "greater"}])
+def test_a_resumed_run_has_the_random_numbers_of_the_stopped_one(loader, options, tmp_path):
+    options = {**options, "model": Noisy, "loader": loader}
+    learn(tmp_path / "whole", 4, **options)
+    for epoch in (1, 2):  # without a validation after it, and with one
+        random.seed(5)
+        np.random.seed(5)  # noqa: NPY002
+        torch.manual_seed(5)
+        work = tmp_path / f"resumed {epoch}"
+        learn(work, 4, tmp_path / f"whole/epoch_{epoch}.pth", **options)
+        found = torch.load(work / "epoch_4.pth", weights_only=False)
+        wanted = torch.load(tmp_path / "whole/epoch_4.pth", weights_only=False)
+        assert torch.equal(found["state_dict"]["weight"], wanted["state_dict"]["weight"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("numpy", ("MT19937", (0,) * 624, 625, 0, 0.0)),
+        ("numpy", ("MT19937", (0,) * 9, 0, 0, 0.0)),
+        ("numpy", 3),
+        ("python", (3, (1, 2), None)),
+        ("torch", torch.zeros(3, dtype=torch.uint8)),
+        ("torch", torch.zeros(5056, dtype=torch.uint8)),
+        ("torch", "x"),
+        ("torch", None),
+    ],
+)
+def test_malformed_random_numbers_are_refused(name, value, tmp_path):
+    learn(tmp_path, 1)
+    checkpoint = torch.load(tmp_path / "epoch_1.pth", weights_only=False)
+    checkpoint["random_states"][0][name] = value
+    torch.save(checkpoint, tmp_path / "odd.pth")
+    with pytest.raises(ValueError, match=r"odd.pth cannot be resumed from: its random numbers"):
+        learn(tmp_path, 2, tmp_path / "odd.pth")
+
+
+def test_random_numbers_that_begin_anew_are_named(tmp_path):
+    learn(tmp_path, 1)
+    checkpoint = torch.load(tmp_path / "epoch_1.pth", weights_only=False)
+    states = checkpoint["random_states"]
+    for kind, values in (("two processes", states * 2), ("earlier version", None)):
+        checkpoint["random_states"] = values
+        work = tmp_path / kind
+        work.mkdir()
+        torch.save(checkpoint, work / "other.pth")
+        learn(work, 2, work / "other.pth")
+        (log,) = work.glob("*/*.log")
+        assert f"begin anew: {work}/other.pth has none of 1 processes" in log.read_text()
 
 
 def test_data_of_another_split_is_refused_unless_allowed(tmp_path):

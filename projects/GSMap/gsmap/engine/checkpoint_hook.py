@@ -21,6 +21,13 @@ from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plai
 from gsmap.checkpoints.unwrapping import unwrap
 from gsmap.engine.figures import finish_checks
 from gsmap.engine.optimizers import fit_optimizer_state
+from gsmap.engine.random_states import (
+    RANDOM_STATES,
+    gather_random_states,
+    get_random_state,
+    resumed_random_state,
+    set_random_state,
+)
 from gsmap.engine.resuming import (
     check_optimizer_state,
     check_resumable,
@@ -132,10 +139,11 @@ class AtomicCheckpointHook(CheckpointHook):
     """mmengine's checkpoint hook, made safe for killed runs and for untrusted checkpoints.
 
     A run that is killed during a save keeps its previous checkpoint, so ``--resume`` always finds a
-    complete one. A validation that was due when the run stopped is run first on resumption. Each
-    checkpoint contains the settings of its model. Checkpoints are loaded with torch's
-    ``weights_only``. When a run begins, the hook allows torch to load the classes that mmengine
-    stores in a checkpoint.
+    complete one. A validation that was due when the run stopped is run first on resumption. A
+    resumed run goes on with the random numbers of the stopped one, except those in the workers of
+    the data loader, and validations do not change them. Each checkpoint contains the settings of
+    its model. Checkpoints are loaded with torch's ``weights_only``. When a run begins, the hook
+    allows torch to load the classes that mmengine stores in a checkpoint.
 
     By default, validation or test data from another split than the training data raise
     ``ValueError``, because the model may have been trained on the places that they show.
@@ -157,6 +165,10 @@ class AtomicCheckpointHook(CheckpointHook):
     ) -> None:
         super().__init__(*args, backend_args=backend_args or {"backend": "atomic"}, **kwargs)
         self.allow_other_split = allow_other_split
+        # States of the random number generators of this process, see `get_random_state`
+        self._resumed_state: dict[str, Any] | None = None  # to set when the training goes on
+        self._state_before_val: dict[str, Any] | None = None  # None outside of a validation
+        self._saved_states: list[dict[str, Any]] | None = None  # of all ranks, during a save
 
     def before_run(self, runner: Runner) -> None:
         """Register the safe checkpoint loaders; mmengine loads a checkpoint after this call."""
@@ -196,6 +208,8 @@ class AtomicCheckpointHook(CheckpointHook):
         meta.pop("config", None)
         if "optimizer" in checkpoint and runner._resume:
             self._fit_optimizer(runner, checkpoint=checkpoint)
+        if runner._resume:
+            self._resumed_state = resumed_random_state(checkpoint, runner=runner)
         trained_meta = meta.get("dataset_meta")
         if isinstance(trained_meta, dict):
             # A loop is None if the run does not have it, or a dict if mmengine has not built it.
@@ -247,6 +261,8 @@ class AtomicCheckpointHook(CheckpointHook):
         settings = plain(runner.cfg.model.to_dict())  # JSON types only
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
         checkpoint["meta"].update(_image_facts(runner))
+        if self._saved_states is not None:
+            checkpoint[RANDOM_STATES] = self._saved_states
 
     def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
         """Save a checkpoint, and write its path to the file `NEWEST`.
@@ -255,7 +271,11 @@ class AtomicCheckpointHook(CheckpointHook):
         """
         if runner.rank == 0:
             remove_link(Path(runner.work_dir, NEWEST))
+        # A better validation saves the checkpoint once more.
+        state = self._state_before_val or get_random_state()
+        self._saved_states = gather_random_states(state)
         super()._save_checkpoint_with_step(runner, step=step, meta=meta)
+        self._saved_states = None
 
     def _check_split(self, trained_meta: dict[str, Any], loop: Any) -> None:
         """Require that evaluation data come from the training's split, and record it for results.
@@ -311,6 +331,36 @@ class AtomicCheckpointHook(CheckpointHook):
         if is_due and runner.val_loop is not None and not is_validated:
             runner.logger.info("The run was cut off before its validation, which is run now.")
             runner.val_loop.run()
+
+    def before_train_epoch(self, runner: Runner) -> None:
+        """Go on with the random numbers of the stopped run, unless workers have to start first.
+
+        Starting the workers of the data loader takes a random number. Persistent workers are
+        started once in a run. An iteration-based training skips batches before it goes on.
+        """
+        is_by_epoch = isinstance(runner.train_loop, EpochBasedTrainLoop)
+        if is_by_epoch and not getattr(runner.train_dataloader, "persistent_workers", False):
+            self._continue_random_numbers()
+
+    def before_train_iter(self, runner: Runner, batch_idx: int, data_batch: Any = None) -> None:
+        """Go on with the random numbers of the stopped run, before the first iteration."""
+        self._continue_random_numbers()
+
+    def _continue_random_numbers(self) -> None:
+        """Set the state that the checkpoint has, once."""
+        if self._resumed_state is not None:
+            set_random_state(self._resumed_state)
+            self._resumed_state = None
+
+    def before_val(self, runner: Runner) -> None:
+        """Keep the state of the random numbers during a validation."""
+        self._state_before_val = get_random_state()
+
+    def after_val(self, runner: Runner) -> None:
+        """Go on with the random numbers as if there had been no validation."""
+        if self._state_before_val is not None:
+            set_random_state(self._state_before_val)
+            self._state_before_val = None
 
     def _forget_foreign_best(self, runner: Runner) -> None:
         """Forget best checkpoints outside of the run's folder, which mmengine might delete."""
