@@ -209,7 +209,7 @@ class AtomicCheckpointHook(CheckpointHook):
         if "optimizer" in checkpoint and runner._resume:
             self._fit_optimizer(runner, checkpoint=checkpoint)
         if runner._resume:
-            self._resumed_state = resumed_random_state(checkpoint, runner=runner)
+            self._resumed_state = resumed_random_state(checkpoint=checkpoint, runner=runner)
         trained_meta = meta.get("dataset_meta")
         if isinstance(trained_meta, dict):
             # A loop is None if the run does not have it, or a dict if mmengine has not built it.
@@ -273,7 +273,7 @@ class AtomicCheckpointHook(CheckpointHook):
             remove_link(Path(runner.work_dir, NEWEST))
         # A better validation saves the checkpoint once more.
         state = self._state_before_val or get_random_state()
-        self._saved_states = gather_random_states(state)
+        self._saved_states = gather_random_states(state=state)
         super()._save_checkpoint_with_step(runner, step=step, meta=meta)
         self._saved_states = None
 
@@ -343,13 +343,19 @@ class AtomicCheckpointHook(CheckpointHook):
             self._continue_random_numbers()
 
     def before_train_iter(self, runner: Runner, batch_idx: int, data_batch: Any = None) -> None:
-        """Go on with the random numbers of the stopped run, before the first iteration."""
+        """Go on with the random numbers of the stopped run, before the first iteration.
+
+        Args:
+            runner: The training.
+            batch_idx: Index of the batch in its epoch.
+            data_batch: The batch.
+        """
         self._continue_random_numbers()
 
     def _continue_random_numbers(self) -> None:
         """Set the state that the checkpoint has, once."""
         if self._resumed_state is not None:
-            set_random_state(self._resumed_state)
+            set_random_state(state=self._resumed_state)
             self._resumed_state = None
 
     def before_val(self, runner: Runner) -> None:
@@ -359,7 +365,7 @@ class AtomicCheckpointHook(CheckpointHook):
     def after_val(self, runner: Runner) -> None:
         """Go on with the random numbers as if there had been no validation."""
         if self._state_before_val is not None:
-            set_random_state(self._state_before_val)
+            set_random_state(state=self._state_before_val)
             self._state_before_val = None
 
     def _forget_foreign_best(self, runner: Runner) -> None:

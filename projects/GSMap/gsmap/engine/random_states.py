@@ -23,7 +23,8 @@ def get_random_state() -> dict[str, Any]:
         The states by library, as numbers, texts, tuples and tensors. ``cuda`` is the state of the
         current GPU; it is absent without one.
     """
-    kind, words, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002
+    numpy_state: Any = np.random.get_state()  # noqa: NPY002
+    kind, words, position, has_gauss, gauss = numpy_state
     state = {
         "python": random.getstate(),
         "numpy": (kind, tuple(words.tolist()), position, has_gauss, gauss),
@@ -83,10 +84,10 @@ def resumed_random_state(checkpoint: dict[str, Any], runner: Runner) -> dict[str
     state = states[runner.rank]
     before = get_random_state()
     try:
-        set_random_state(state)
+        set_random_state(state=state)
     except _FAULTS as error:
         reason = f"its random numbers are malformed ({type(error).__name__}: {error})"
-        raise refusal(source, reason=reason) from error
+        raise refusal(path=source, reason=reason) from error
     finally:
-        set_random_state(before)
+        set_random_state(state=before)
     return state
