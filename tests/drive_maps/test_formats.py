@@ -325,6 +325,7 @@ def test_poses_in_a_grid_lie_where_the_grid_says():
         ("EPSG:3857", (10.0, 10.0), True),
         ("EPSG:31468", (4_470_315.0, 5_329_181.0), True),
         ("EPSG:25832+7837", (693_566.0, 5_330_684.0), True),
+        ("EPSG:31288", (176_675.0, 5_227_960.0), True),  # longitudes from Ferro
         ("EPSG:32650", (1e12, 0.0), False),
         ("EPSG:32650", (math.nan, 0.0), False),
     ],

@@ -14,6 +14,7 @@ from gsmap.utils.extras import import_extra
 # Largest absolute x and y of a map around an origin. Coordinates of a map grid are usually larger.
 _FARTHEST_M = 100_000.0
 _BEYOND_AREA_DEG = 5.0  # maps of a country leave the area of a grid by some degrees
+_STEP_M = 100.0  # length along which a metre of a grid is compared with a metre on the ground
 _MAX_STRETCH = 0.01  # largest difference of a metre of a grid from a metre on the ground
 
 
@@ -187,9 +188,12 @@ class MapGrid:
                 f"({system.name}): x must be the easting and y the northing in this grid; if "
                 "positions are metres from a place, give its --origin LAT LON instead of --crs."
             )
-        factors = pyproj.Proj(system).get_factors(lon_deg, lat_deg)
-        scales = np.stack([factors.meridional_scale, factors.parallel_scale])
-        stretch = np.abs(scales - 1.0).max(axis=0)
+        geod = pyproj.Geod(ellps="WGS84")
+        stretch = np.zeros(len(points))
+        for step_m in ((_STEP_M, 0.0), (0.0, _STEP_M)):  # along x and along y
+            next_lon_deg, next_lat_deg = self.lon_lat(points + step_m).T
+            _, _, ground_m = geod.inv(lon_deg, lat_deg, next_lon_deg, next_lat_deg)
+            stretch = np.fmax(stretch, np.abs(_STEP_M / ground_m - 1.0))
         if stretch.max(initial=0.0) > _MAX_STRETCH:
             x, y = points[stretch.argmax()]
             raise InputError(
