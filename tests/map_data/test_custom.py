@@ -182,14 +182,14 @@ def test_a_missing_or_broken_image_is_named(tmp_path: Path):
         from_records(tmp_path / "a.arrow", [bare], META, tmp_path)
 
 
-def test_a_map_in_pieces_is_joined_on_request(tmp_path: Path):
+def test_a_map_in_pieces_is_joined_on_request(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """Two tiles meet at x = 0, 5 cm apart; the second line of the east runs west.
 
     .. code-block:: text
 
         y = 2:  -20 ---- 0 | 0 ---- 20     one line
         y = -2: -20 ---- 0, then a fork to (20, -2) and (20, -6): three lines stay
-        a crossing stays a ring, a boundary is no divider
+        two halves of a crossing are one ring, a boundary is no divider
     """
     ring = [[8, -4], [11, -4], [11, 4], [8, 4], [8, -4]]
     pieces = [
@@ -198,12 +198,16 @@ def test_a_map_in_pieces_is_joined_on_request(tmp_path: Path):
         {"label": 0, "points": [[-20, -2], [0, -2]]},
         {"label": 0, "points": [[0, -2], [20, -2]]},
         {"label": 0, "points": [[0, -2], [20, -6]]},
-        {"label": 1, "points": ring},
+        {"label": 1, "points": ring[:3]},
+        {"label": 1, "points": ring[2:]},
         {"label": 2, "points": [[0, 2], [0, 10]]},
     ]
-    assert len(elements(tmp_path, *pieces)) == 7
+    assert len(elements(tmp_path, *pieces)) == 8
+    assert "open lines" in caplog.text
+    caplog.clear()
     from_records(tmp_path / "j.arrow", [record(instances=pieces)], META, tmp_path, join=True)
     found = AnnotationFile(tmp_path / "j.arrow")[0].instances
+    assert "open lines" not in caplog.text
     assert sorted(item.label for item in found) == [0, 0, 0, 0, 1, 2]
     (whole,) = [item.points for item in found if np.ptp(item.points[:, 0]) > 30]
     assert sorted(whole[:, 0].tolist()) == [-20, 0, 20]

@@ -167,10 +167,10 @@ def create_samples(
             check_samples([sample], meta)  # raises an error for a wrong shape or value
             count += 1
             had_elements = bool(sample.instances)
-            if any(_is_open_area(element, meta) for element in sample.instances or []):
-                open_tokens.append(sample.token)
             if sample.instances is not None:
                 sample.instances = _clip_elements(sample.instances, meta=meta, join=join)
+            if any(_is_open_area(element, meta) for element in sample.instances or []):
+                open_tokens.append(sample.token)
         if had_elements and not sample.instances:
             empty_tokens.append(sample.token)
         if sample.ego_from_frame is None and meta.frame == "lidar" and not has_warned:
@@ -188,7 +188,7 @@ def create_samples(
 def _is_open_area(element: MapInstance, meta: AnnotationMeta) -> bool:
     """Whether an element of a class of areas is no closed ring."""
     is_area = meta.classes[element.label] in AREA_CLASSES
-    return is_area and not is_closed(np.asarray(element.points))
+    return is_area and not is_closed(element.points)
 
 
 def _clip_elements(
