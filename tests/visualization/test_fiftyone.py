@@ -66,7 +66,7 @@ def test_results_of_other_samples_are_refused(annotations, tmp_path):
 
 
 def test_what_is_left_out_is_named(annotations, tmp_path):
-    tree = {"cls_name": "tree", "pts": [[0, 0], [1, 1]], "confidence_level": 0.5}
+    tree = {"cls_name": "tree", "pts": [[0, 0]], "confidence_level": 0.5}
     short = {"cls_name": "divider", "pts": [[5, 0]], "confidence_level": 0.5}
     one = {"sample_token": "a", "vectors": [tree, short]}
     samples = [one, {"sample_token": "b", "vectors": []}]

@@ -77,7 +77,7 @@ class SampleFile:
         left_out: Tokens of samples that iterating leaves out, such as those of other shards.
         ignored: Number of elements of each other class, and number of samples with heights
             (``THREE_D``), in the samples yielded so far.
-        num_short: Number of elements of fewer than two points in these samples.
+        num_short: Number of elements of the classes with fewer than two points in these samples.
         about: Metadata of the file. It is set after the last sample was read, and not validated.
     """
 
@@ -120,7 +120,8 @@ class SampleFile:
             tokens.add(token)
             if token not in self.left_out:
                 elements = self._elements_of(item, self.ignored)
-                self.num_short += int((elements.num_points < 2).sum())
+                is_short = (elements.num_points < 2) & (elements.labels >= 0)
+                self.num_short += int(is_short.sum())
                 yield item, token, elements, place
         meta = other_entries["meta"]
         self.about = meta if isinstance(meta, dict) else {}
