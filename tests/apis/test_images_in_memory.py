@@ -227,6 +227,8 @@ def test_a_live_rig_may_lose_a_camera_and_get_it_back(inferencer, tmp_path):
     np.testing.assert_array_equal(live(images).points, whole)
     with pytest.raises(ValueError, match=r"must have the cameras of the images, \['CAM_BACK'\]"):
         inferencer.live(*rig)(left)
+    with pytest.raises(ValueError, match=r"\['roof'\], got \['CAM_FRONT', 'CAM_BACK'\]"):
+        live({"roof": images["CAM_BACK"]})
 
 
 @pytest.mark.parametrize(

@@ -325,7 +325,7 @@ class LiveMap:
 
 
 def _of_cameras(values: Cameras, names: Collection[str]) -> Cameras:
-    """Arrays of the cameras with these names; all arrays if they are in a list."""
-    if not isinstance(values, Mapping):
+    """Arrays of the cameras with these names; all arrays if they are in a list or lack a name."""
+    if not isinstance(values, Mapping) or not set(names) <= set(map(str, values)):
         return values
     return {name: value for name, value in values.items() if str(name) in names}
