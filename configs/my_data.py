@@ -17,7 +17,8 @@ _queries = 20  # most elements that are found in a sample; `create_data.py check
 _sides = [b - a for a, b in (grid['x_range'], grid['y_range'])]  # of the map along x and y, in metres
 _cells = [round(side / _base_.model.bev_encoder.bev_pixel_m) for side in _sides]
 _cell_m = [side / cells for side, cells in zip(_sides, _cells)]  # the base's size, changed a little to divide the map
-_pixels = _base_.model.map_head.get('masks', dict(pixel_m=max(_sides) / 200, cost_pixel_m=max(_sides) / 128))
+_pixels = dict(pixel_m=max(_sides) / 200, cost_pixel_m=max(_sides) / 128)  # the usual ones, if the base has none
+_pixels = dict(_pixels, **_base_.model.map_head.get('masks', {}))
 _mask_m = [side / round(side / _pixels['pixel_m']) for side in _sides]
 _cost_m = [side / round(side / _pixels['cost_pixel_m']) for side in _sides]
 _data = dict(data_root=data_root, frame=_frame, ground_z_m=_ground_z, cameras=_cameras, grid=grid, classes=classes)

@@ -87,3 +87,20 @@ def test_the_template_takes_any_range(tmp_path, ahead, left):
     steps = config.train_dataloader.dataset.pipeline
     (mask,) = [step for step in steps if step.type == "MakeBEVMask"]
     assert mask["size"] == [grid.height, grid.width]
+
+
+def test_the_template_keeps_other_settings_of_masks(tmp_path):
+    head = "type='GSMapHead', masks=dict(_delete_=True, line_width_m=1.5)"
+    (tmp_path / "base.py").write_text(
+        f"_base_ = '{REPO}/configs/maptr/maptr_r18_minicity.py'\n"
+        f"model = dict(map_head=dict({head}))\n"
+    )
+    template = (REPO / "configs/my_data.py").read_text()
+    edited = template.replace("./maptr/maptr_r18_minicity.py", "./base.py")
+    (tmp_path / "my_city.py").write_text(edited)
+    masks = Config.fromfile(tmp_path / "my_city.py").model.map_head.masks
+    assert masks == {
+        "line_width_m": 1.5,
+        "pixel_m": pytest.approx([0.3, 0.3]),
+        "cost_pixel_m": pytest.approx([60 / 128, 60 / 128]),
+    }
