@@ -9,6 +9,7 @@ from mmengine.dist import all_gather_object
 from mmengine.runner import Runner
 
 from gsmap.engine.resuming import refusal
+from gsmap.utils.errors import InputError
 
 RANDOM_STATES = "random_states"  # key in a checkpoint: states of all processes, by rank
 _NUM_WORDS = 624  # words of a Mersenne Twister, the generator of Python and of numpy
@@ -46,7 +47,7 @@ def set_random_state(state: dict[str, Any]) -> None:
     """
     _, _, position, _, _ = state["numpy"]
     if type(position) is not int or not 0 <= position <= _NUM_WORDS:
-        raise ValueError(f"position {position!r:.40} of numpy's random numbers")
+        raise InputError(f"position {position!r:.40} of numpy's random numbers")
     random.setstate(state["python"])
     np.random.set_state(state["numpy"])  # noqa: NPY002
     torch.set_rng_state(state["torch"].cpu())

@@ -101,7 +101,8 @@ class BEVGrid:
         if is_empty or rounding > 1e-3:
             raise InputError(
                 f"pixels of {size_x:g} x {size_y:g} m do not divide the map of "
-                f"{length_x:g} x {length_y:g} m."
+                f"{length_x:g} x {length_y:g} m: choose sides that are multiples of the pixels, or "
+                "pixels that divide the sides."
             )
         return self.with_size(height, width)
 
