@@ -478,7 +478,13 @@ def open_map(path: Path, args: argparse.Namespace, ann: AnnotationFile, place: s
 
 
 def lies_near(elements: MapElements, ann: AnnotationFile, place: str) -> bool:
-    """Whether the bounding box of an element is within 1 km of the samples of a place."""
+    """Whether the bounding box of an element is within 1 km of the samples of a place.
+
+    Args:
+        elements: Elements of a map, in metres in the global frame.
+        ann: The samples.
+        place: Name of the map of the place.
+    """
     positions = [sample.global_from_frame[:2, 3] for sample in ann if sample.map_name == place]
     low = np.min(positions, axis=0) - _NEAR_M
     high = np.max(positions, axis=0) + _NEAR_M
