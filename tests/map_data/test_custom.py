@@ -148,6 +148,11 @@ def test_lidar_and_signals_are_kept(tmp_path: Path):
         (record(instances=[{"label": 0, "points": [[0, np.nan], [1, 1]]}]), "NaN"),
         ({**record(), "token": 5}, "sample 5: token must be text, got 5"),
         (record(scene=7), "sample 't': scene must be text, got 7"),
+        ({**record(), "timestamp_ns": 0.5}, "sample 't': timestamp_ns must be a whole number"),
+        (
+            record(instances=[{"label": 1.7, "points": [[0, 0], [1, 1]]}]),
+            "record 't' cannot be used: label must be a whole number, got 1.7",
+        ),
         (record(lidar={"path": Path("l.bin")}), "sample 't': path must be text, got PosixPath"),
         (
             record(instances=[{"label": 1, "points": [[0, 0], [40, 9], [40, 0], [0, 9], [0, 0]]}]),

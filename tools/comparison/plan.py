@@ -293,7 +293,8 @@ def _map_metric(cfg: Config) -> str:
     if not isinstance(metrics, list):
         return name
     for number, metric in enumerate(metrics):
-        if issubclass(class_of_type(metric.get("type"), METRICS) or object, MapMetric):
+        kind = metric.get("type") if isinstance(metric, Mapping) else None
+        if issubclass(class_of_type(kind, METRICS) or object, MapMetric):
             return f"{name}.{number}"
     raise InputError(
         f"{cfg.filename}: {name} has no MapMetric, whose figures are compared: add it."

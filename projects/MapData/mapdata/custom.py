@@ -19,6 +19,7 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
+from gsmap.datasets.annotations.schema import whole_number
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size, read_image
 from gsmap.structures.classes import AREA_CLASSES, LINE_CLASSES
@@ -426,7 +427,7 @@ def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
 def _class_index(label: Any, meta: AnnotationMeta) -> int:
     """Index of a class that is given by its name or its index."""
     if not isinstance(label, str):
-        return int(label)
+        return whole_number(label, name="label")
     if label not in meta.classes:
         raise InputError(f"label {label!r} is not among {meta.classes}.")
     return meta.classes.index(label)

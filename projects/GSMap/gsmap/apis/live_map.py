@@ -24,9 +24,9 @@ _LOGGER = logging.getLogger(__name__)
 # does not use them for an independent sample.
 _SINGLE_FRAME = Frame(token="in memory", scene="", timestamp_ns=0, pose=np.eye(4))
 _NO_SIGNALS_TEXT = (
-    "the model was trained with vehicle signals, and a frame without them is taken for that of a "
-    "standing vehicle, which makes the map worse: give can_bus, which motion_signals of "
-    "gsmap.structures.vehicle_signals (pose_only_signals for configs that have it) makes of poses."
+    "the model was trained with vehicle signals, and without them its maps are worse: give "
+    "can_bus. From poses, motion_signals of gsmap.structures.vehicle_signals makes it (pose_only_signals "
+    "for configs that have it)."
 )
 
 if TYPE_CHECKING:

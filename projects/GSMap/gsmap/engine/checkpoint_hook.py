@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import HOOKS
+from mmengine.dist import all_gather_object
 from mmengine.fileio import LocalBackend, register_backend
 from mmengine.hooks import CheckpointHook
 from mmengine.optim import OptimWrapper
@@ -23,7 +24,6 @@ from gsmap.engine.figures import finish_checks
 from gsmap.engine.optimizers import fit_optimizer_state
 from gsmap.engine.random_states import (
     RANDOM_STATES,
-    gather_random_states,
     get_random_state,
     resumed_random_state,
     set_random_state,
@@ -273,7 +273,7 @@ class AtomicCheckpointHook(CheckpointHook):
             remove_link(Path(runner.work_dir, NEWEST))
         # A better validation saves the checkpoint once more.
         state = self._state_before_val or get_random_state()
-        self._saved_states = gather_random_states(state=state)
+        self._saved_states = all_gather_object(state)
         super()._save_checkpoint_with_step(runner, step=step, meta=meta)
         self._saved_states = None
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from mmengine.dist import all_gather_object
 from mmengine.runner import Runner
 
 from gsmap.engine.resuming import refusal
@@ -53,11 +52,6 @@ def set_random_state(state: dict[str, Any]) -> None:
     torch.set_rng_state(state["torch"].cpu())
     if "cuda" in state and torch.cuda.is_available():
         torch.cuda.set_rng_state(state["cuda"].cpu())
-
-
-def gather_random_states(state: dict[str, Any]) -> list[dict[str, Any]]:
-    """Collect the states of all processes, by rank. Every process must call this function."""
-    return all_gather_object(state)
 
 
 def resumed_random_state(checkpoint: dict[str, Any], runner: Runner) -> dict[str, Any] | None:

@@ -95,7 +95,8 @@ def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]
 
     Raises:
         ValueError: If a matrix or the points of an element have a wrong shape or are not numeric,
-            or a name, token or path is no text.
+            if a name, token or path is no text, or if a label, a time or a size of an image is no
+            whole number.
     """
     if isinstance(record, MapSample):
         where += f"sample {record.token!r}: "
@@ -112,10 +113,29 @@ def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]
             value = [row_of(item, meta, where=where) for item in value]
         elif isinstance(value, LidarRecord):
             value = row_of(value, meta, where=where)
-        elif name in _TEXTS and not isinstance(value, str | bytes | None):
-            raise InputError(f"{where}{name} must be text, got {value!r:.80}.")
-        row[name] = int(value) if name in _INTEGERS else value
+        elif name in _INTEGERS:
+            value = whole_number(value, name=f"{where}{name}")
+        elif name in _TEXTS:
+            _require_text(value, name=f"{where}{name}")
+        row[name] = value
     return row
+
+
+def _require_text(value: Any, name: str) -> None:
+    """Raise a ``ValueError`` if a value is neither text nor missing."""
+    if not isinstance(value, str | bytes | None):
+        raise InputError(f"{name} must be text, got {value!r:.80}.")
+
+
+def whole_number(value: Any, name: str) -> int:
+    """Convert a number, such as 3.0, to an integer.
+
+    Raises:
+        ValueError: If the number is not whole; ``name`` begins the message.
+    """
+    if isinstance(value, (float, np.floating)) and not float(value).is_integer():
+        raise InputError(f"{name} must be a whole number, got {value!r:.80}.")
+    return int(value)
 
 
 def _flatten(value: Any, name: str, dim: int, where: str) -> np.ndarray:
