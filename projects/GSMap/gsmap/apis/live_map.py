@@ -25,8 +25,8 @@ _LOGGER = logging.getLogger(__name__)
 _SINGLE_FRAME = Frame(token="in memory", scene="", timestamp_ns=0, pose=np.eye(4))
 _NO_SIGNALS_TEXT = (
     "the model was trained with vehicle signals, and without them its maps are worse: give "
-    "can_bus. From poses, motion_signals of gsmap.structures.vehicle_signals makes it (pose_only_signals "
-    "for configs that have it)."
+    "can_bus. From poses, motion_signals of gsmap.structures.vehicle_signals makes it "
+    "(pose_only_signals for configs that have it)."
 )
 
 if TYPE_CHECKING:

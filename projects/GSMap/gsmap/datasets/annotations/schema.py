@@ -113,18 +113,19 @@ def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]
             value = [row_of(item, meta, where=where) for item in value]
         elif isinstance(value, LidarRecord):
             value = row_of(value, meta, where=where)
-        elif name in _INTEGERS:
-            value = whole_number(value, name=f"{where}{name}")
-        elif name in _TEXTS:
-            _require_text(value, name=f"{where}{name}")
+        else:
+            value = _checked_scalar(value, name=name, where=where)
         row[name] = value
     return row
 
 
-def _require_text(value: Any, name: str) -> None:
-    """Raise a ``ValueError`` if a value is neither text nor missing."""
-    if not isinstance(value, str | bytes | None):
-        raise InputError(f"{name} must be text, got {value!r:.80}.")
+def _checked_scalar(value: Any, name: str, where: str) -> Any:
+    """Convert a whole number to an integer, and require texts where the file has texts."""
+    if name in _INTEGERS:
+        return whole_number(value, name=f"{where}{name}")
+    if name in _TEXTS and not isinstance(value, str | bytes | None):
+        raise InputError(f"{where}{name} must be text, got {value!r:.80}.")
+    return value
 
 
 def whole_number(value: Any, name: str) -> int:
