@@ -28,6 +28,7 @@ from gsmap.engine.resuming import check_optimizer_state
 from gsmap.engine.run_log import MapRunner
 from gsmap.utils.files import SUFFIX
 from gsmap.utils.shards import digest
+from gsmap.utils.worker_seeds import follow_epoch
 
 
 @pytest.fixture
@@ -359,6 +360,36 @@ def test_a_resumed_run_has_the_random_numbers_of_the_stopped_one(loader, options
         found = torch.load(work / "epoch_4.pth", weights_only=False)
         wanted = torch.load(tmp_path / "whole/epoch_4.pth", weights_only=False)
         assert torch.equal(found["state_dict"]["weight"], wanted["state_dict"]["weight"])
+
+
+class Augmented(torch.utils.data.Dataset):
+    """Samples with random numbers of all libraries, drawn where they are loaded."""
+
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, index):
+        follow_epoch()
+        noise = random.gauss(1, 0.1) + np.random.normal() + torch.rand(())  # noqa: NPY002
+        return {"inputs": noise + index}
+
+
+class Reader(Learner):
+    """A learner with its inputs in its loss."""
+
+    def forward(self, inputs, data_samples=None, mode="tensor"):
+        return {"loss": (inputs * self.weight**2).sum()}
+
+
+@pytest.mark.parametrize("persistent", [False, True])
+def test_a_resumed_run_has_the_augmentation_of_the_stopped_one(persistent, tmp_path):
+    loader = {"num_workers": 2, "persistent_workers": persistent}
+    options = {"model": Reader, "loader": loader, "train": Augmented(), "lr": 0.01}
+    learn(tmp_path / "whole", 3, **options)
+    learn(tmp_path / "resumed", 3, tmp_path / "whole/epoch_1.pth", **options)
+    found = torch.load(tmp_path / "resumed/epoch_3.pth", weights_only=False)
+    wanted = torch.load(tmp_path / "whole/epoch_3.pth", weights_only=False)
+    assert torch.equal(found["state_dict"]["weight"], wanted["state_dict"]["weight"])
 
 
 @pytest.mark.parametrize(

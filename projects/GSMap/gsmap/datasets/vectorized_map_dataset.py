@@ -23,6 +23,7 @@ from gsmap.utils.faults import user_message
 from gsmap.utils.model_facts import MOUNT, RIG
 from gsmap.utils.overrides import describe_override
 from gsmap.utils.split_lists import SPLIT_LIST
+from gsmap.utils.worker_seeds import follow_epoch
 
 _BROKEN_MODES = ("raise", "skip")
 # Metadata of the annotation file that are copied to the metainfo of the data set. `SPLIT_LIST` is
@@ -522,6 +523,7 @@ class VectorizedMapDataset(BaseDataset):
             RuntimeError: If more than ``max_refetch`` consecutive samples are broken.
             ValueError: If an override of the command (``--cfg-options``) causes an error.
         """
+        follow_epoch()
         try:
             data = self.pipeline(self.get_data_info(idx))
             if data is None:  # mmengine would take another sample in silence

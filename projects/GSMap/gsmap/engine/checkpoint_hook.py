@@ -45,6 +45,7 @@ from gsmap.utils.split_lists import (
     checked_identity,
     require_same_list,
 )
+from gsmap.utils.worker_seeds import seed_epoch
 
 NEWEST = "last_checkpoint"  # file in a work folder, written by mmengine
 VALIDATED = "last_validation"  # file in a work folder: iteration of the latest validation
@@ -140,10 +141,11 @@ class AtomicCheckpointHook(CheckpointHook):
 
     A run that is killed during a save keeps its previous checkpoint, so ``--resume`` always finds a
     complete one. A validation that was due when the run stopped is run first on resumption. A
-    resumed run goes on with the random numbers of the stopped one, except those in the workers of
-    the data loader, and validations do not change them. Each checkpoint contains the settings of
-    its model. Checkpoints are loaded with torch's ``weights_only``. When a run begins, the hook
-    allows torch to load the classes that mmengine stores in a checkpoint.
+    resumed run goes on with the random numbers of the stopped one, and validations do not change
+    them. Workers of the data loader begin anew with each epoch; those of an iteration-based
+    training begin anew on resumption. Each checkpoint contains the settings of its model.
+    Checkpoints are loaded with torch's ``weights_only``. When a run begins, the hook allows torch
+    to load the classes that mmengine stores in a checkpoint.
 
     By default, validation or test data from another split than the training data raise
     ``ValueError``, because the model may have been trained on the places that they show.
@@ -333,13 +335,18 @@ class AtomicCheckpointHook(CheckpointHook):
             runner.val_loop.run()
 
     def before_train_epoch(self, runner: Runner) -> None:
-        """Go on with the random numbers of the stopped run, unless workers have to start first.
+        """Seed the loader's workers, and go on with the random numbers of the stopped run.
 
         Starting the workers of the data loader takes a random number. Persistent workers are
-        started once in a run. An iteration-based training skips batches before it goes on.
+        started once in a run, so the run goes on later. The workers of an iteration-based training
+        have started before, and it skips batches before it goes on.
         """
-        is_by_epoch = isinstance(runner.train_loop, EpochBasedTrainLoop)
-        if is_by_epoch and not getattr(runner.train_dataloader, "persistent_workers", False):
+        if not isinstance(runner.train_loop, EpochBasedTrainLoop):
+            return
+        loader = runner.train_dataloader
+        if getattr(loader, "num_workers", 0):
+            seed_epoch(loader, seed=runner.seed, epoch=runner.epoch, rank=runner.rank)
+        if not getattr(loader, "persistent_workers", False):
             self._continue_random_numbers()
 
     def before_train_iter(self, runner: Runner, batch_idx: int, data_batch: Any = None) -> None:
