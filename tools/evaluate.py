@@ -63,6 +63,7 @@ from gsmap.utils.words import format_count
 
 # Names of reports that `print_reports` skips, because the code that makes them also prints them.
 PRINTED = ("intervals", "by", "uncertainty", "changes")
+_PRIOR_ELEMENTS = 50  # elements of --prior without --prior-elements
 
 
 class TruthSettings(NamedTuple):
@@ -193,11 +194,14 @@ def evaluate_input(args: argparse.Namespace, evaluator: MapEvaluator) -> Evaluat
         return evaluate_results(args.results, args, evaluator)
     from gsmap.evaluation.analysis.prior import evaluate_prior
 
+    max_elements = args.prior_elements
+    if max_elements is None:
+        max_elements = _PRIOR_ELEMENTS
     return evaluate_prior(
         args.prior,
         args.ground_truth,
         evaluator=evaluator,
-        max_elements=args.prior_elements,
+        max_elements=max_elements,
         allow_other_split=args.allow_other_split,
     )
 

@@ -17,6 +17,8 @@ from gsmap.visualization.film import write_drive_film
 from gsmap.visualization.page.page import PageOptions, is_own_page, page_data, write_page
 
 _PAGE = Path("report.html")  # page to write without --out
+_PAGE_SUFFIXES = (".html", ".htm")
+_FILM_SUFFIX = ".mp4"
 # Width of a page's images without --image-width. The option has no default, so that a film, to
 # which it does not apply, can refuse it.
 _IMAGE_WIDTH_PX = 320
@@ -79,7 +81,11 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("--scene", help="drive of a film; default: the first one of --ann")
     args = parser.parse_args()
-    is_film = args.out.suffix.lower() == ".mp4"
+    suffix = args.out.suffix.lower()
+    if suffix not in (*_PAGE_SUFFIXES, _FILM_SUFFIX):
+        names = " or ".join([*_PAGE_SUFFIXES, _FILM_SUFFIX])
+        parser.error(f"--out {args.out}: give a name that ends with {names}")
+    is_film = suffix == _FILM_SUFFIX
     if is_film and (args.by or args.allow_mismatch or args.image_width is not None):
         parser.error("--by, --allow-mismatch and --image-width apply to pages: leave them out")
     if is_film and (args.allow_other_split or args.law or args.changes):
@@ -117,7 +123,7 @@ def main() -> str:
         image_width_px = args.image_width
     else:
         image_width_px = _IMAGE_WIDTH_PX
-    if args.out.suffix.lower() == ".mp4":
+    if args.out.suffix.lower() == _FILM_SUFFIX:
         return write_drive_film(
             args.out,
             annotations=args.ann,

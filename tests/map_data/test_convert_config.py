@@ -95,9 +95,9 @@ def test_a_method_becomes_the_same_head(ours, tmp_path):
 
 
 def test_settings_of_ones_own_arrive(tmp_path):
-    text = upstream_configs.maptr(
-        queries="num_vec=70,", scale=0.4, epochs=30, more="fp16 = dict(loss_scale=512.)"
-    ).replace("points = 20", "points = 30")
+    more = "fp16 = dict(loss_scale=512.)\nfind_unused_parameters = True\ncudnn_benchmark = True"
+    text = upstream_configs.maptr(queries="num_vec=70,", scale=0.4, epochs=30, more=more)
+    text = text.replace("points = 20", "points = 30")
     cfg, _ = converted(text, tmp_path)
     assert cfg.model.map_head.query_groups == [{"num": 70}]
     assert cfg.model.map_head.num_points == 30
@@ -110,6 +110,8 @@ def test_settings_of_ones_own_arrive(tmp_path):
     assert "T_max" not in cfg.param_scheduler[1]  # as long as the training
     assert cfg.optim_wrapper.type == "AmpOptimWrapper"
     assert cfg.optim_wrapper.loss_scale == 512
+    assert cfg.find_unused_parameters
+    assert cfg.env_cfg.cudnn_benchmark
 
 
 @pytest.mark.parametrize(("x_m", "y_m"), [(30.0, 15.0), (15.0, 30.0), (50.0, 25.0)])

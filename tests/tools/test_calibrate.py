@@ -185,6 +185,8 @@ def test_the_command_scores_and_draws_sigmas(files, tmp_path, capsys):
     [
         (["--reliability", "a.png"], "--reliability needs --uncertainty"),
         (["--law", "laplace"], "--law needs --uncertainty"),
+        (["--seed", "1"], "--seed is for resamples: give --bootstrap or --against"),
+        (["--prior-elements", "9"], "--prior-elements needs --prior"),
         (
             ["--uncertainty", "--shard", "0/2", "--out", "a.json"],
             "--uncertainty needs all samples: leave out --shard",

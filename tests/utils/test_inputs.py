@@ -171,7 +171,7 @@ def test_two_options_cannot_name_one_file(folder, capsys):
         "tools/evaluate.py R ANN --eval chamfer --pr-curves ANN",
         "tools/evaluate.py R ANN --eval chamfer --by GROUPS --out GROUPS",
         "tools/compact_results.py R LINK",
-        "tools/report.py R --ann ANN --no-images --out ANN",
+        "tools/report.py R --ann ANN --no-images --out PAGE",
         "tools/convert_config.py CONFIG CONFIG",
         "tools/analyze_run.py SCALARS --table SCALARS",
         "tools/infer.py ROOT --check-calibration IMAGE",
@@ -186,6 +186,7 @@ def test_commands_keep_what_they_read(words, minicity_root, minicity_annotations
     results.write_text(f'{{"results": [{rows}]}}')
     (tmp_path / "link.json").symlink_to(results)
     os.link(annotations, tmp_path / "hard.arrow")
+    os.link(annotations, tmp_path / "hard.html")
     config.write_text("model = dict(type='MapTR')\n")
     groups, scalars = tmp_path / "groups.json", tmp_path / "scalars.json"
     groups.write_text("{" + ", ".join(f'"{t}": "day"' for t in tokens) + "}")
@@ -204,7 +205,7 @@ def test_commands_keep_what_they_read(words, minicity_root, minicity_annotations
     places = {
         "ANN": annotations, "HARD": tmp_path / "hard.arrow", "R": results, "CONFIG": config,
         "LINK": tmp_path / "link.json", "GROUPS": groups, "SCALARS": scalars, "ROOT": root,
-        "IMAGE": image,
+        "IMAGE": image, "PAGE": tmp_path / "hard.html",
     }  # fmt: skip
     before = {path: path.read_bytes() for path in places.values() if path.is_file()}
     tool, *rest = words.split()

@@ -156,7 +156,7 @@ def read_resamples(args: argparse.Namespace) -> "Resamples | None":
     from gsmap.evaluation.analysis.bootstrap import Resamples
 
     count = DEFAULT_RESAMPLES if args.bootstrap is None else args.bootstrap
-    return Resamples(scenes_of(args.ground_truth), count, args.seed)
+    return Resamples(scenes_of(args.ground_truth), count, seed=args.seed or 0)
 
 
 def interval_report(

@@ -52,7 +52,7 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
         metavar="TRAIN",
         help="score the best fixed set of elements, fitted on this ground truth",
     )
-    group.add_argument("--prior-elements", type=int, default=50, help="elements in that set")
+    group.add_argument("--prior-elements", type=int, help="elements in that set (50)")
     group.add_argument("--classes", nargs="+", help="default: the annotation file's, or MapTR's")
     group.add_argument(
         "--allow-mismatch",
@@ -167,7 +167,7 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="interval of 95 %% for every AP, from N resamples of the scenes (1000)",
     )
-    group.add_argument("--seed", type=int, default=0, help="seed of the resamples")
+    group.add_argument("--seed", type=int, help="seed of the resamples (0)")
     group.add_argument(
         "--against",
         type=Path,
@@ -237,8 +237,12 @@ def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace
         parser.error("--reliability needs --uncertainty")
     if args.law and not args.uncertainty:
         parser.error("--law needs --uncertainty")
+    if args.seed is not None and args.bootstrap is None and not args.against:
+        parser.error("--seed is for resamples: give --bootstrap or --against, or leave it out")
     if args.prior:
         check_prior(parser, args)
+    elif args.prior_elements is not None:
+        parser.error("--prior-elements needs --prior")
     check_changes(parser, args)
     if args.by == DISTANCE and args.dim == 3:
         parser.error("--by distance is in the plane: leave out --dim 3")

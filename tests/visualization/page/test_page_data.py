@@ -295,6 +295,10 @@ def test_the_command_writes_the_page_and_says_its_size(case, tmp_path):
     failed = run_tool("tools/report.py", *both, "--names", "GSMap")
     assert failed.returncode == 2
     assert "--names must give 2 different names" in failed.stderr
+    failed = run_tool("tools/report.py", *both[:-1], tmp_path / "report.pdf")
+    assert failed.returncode == 2
+    assert "give a name that ends with .html or .htm or .mp4" in failed.stderr
+    assert not (tmp_path / "report.pdf").exists()
 
 
 def test_the_package_carries_the_page():

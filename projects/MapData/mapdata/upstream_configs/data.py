@@ -42,6 +42,8 @@ SCHEDULE = {
     "checkpoint_config.max_keep_ckpts": "default_hooks.checkpoint.max_keep_ckpts",
     "log_config.interval": "default_hooks.logger.interval",
     "load_from": "load_from",
+    "cudnn_benchmark": "env_cfg.cudnn_benchmark",
+    "find_unused_parameters": "find_unused_parameters",
 }
 
 

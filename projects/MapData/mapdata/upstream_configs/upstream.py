@@ -27,7 +27,7 @@ _TYPE = re.compile(r"(mmdet\.)?\w+")  # name of a registered class, and no path 
 TOP_LEVEL_NAMES = (
     "_base_", "model", "data", "optimizer", "optimizer_config", "lr_config", "total_epochs",
     "runner", "evaluation", "fp16", "checkpoint_config", "log_config", "load_from",
-    "resume_from", "custom_hooks", "momentum_config",
+    "resume_from", "custom_hooks", "momentum_config", "cudnn_benchmark", "find_unused_parameters",
 )  # fmt: skip
 # sections of a GSMap config
 _HEAD = "model.map_head."
