@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pyarrow.feather as feather
 import pytest
 from argoverse2_road import (
@@ -194,7 +195,11 @@ def test_a_sample_with_a_missing_image_is_left_out_and_counted(tmp_path):
 def test_bad_logs_are_left_out_with_their_reason_and_the_rest_goes_on(tmp_path):
     split = tmp_path / "val"
     write_log(split / "log-good")
-    for name in ("log-no-map", "log-bad-json", "log-no-poses", "log-bad-poses", "log-no-calib"):
+    bad = (
+        "log-no-map", "log-bad-json", "log-no-poses", "log-bad-poses", "log-two-poses",
+        "log-no-calib",
+    )  # fmt: skip
+    for name in bad:
         write_log(split / name)
     for path in (split / "log-no-map" / "map").iterdir():
         path.unlink()
@@ -202,16 +207,22 @@ def test_bad_logs_are_left_out_with_their_reason_and_the_rest_goes_on(tmp_path):
     (split / "log-no-poses" / "city_SE3_egovehicle.feather").unlink()
     (split / "log-bad-poses" / "city_SE3_egovehicle.feather").write_bytes(b"nothing")
     (split / "log-no-calib" / "calibration" / "intrinsics.feather").unlink()
+    poses = feather.read_feather(split / "log-good/city_SE3_egovehicle.feather")
+    poses = pd.concat([poses, poses])
+    feather.write_feather(poses, split / "log-good/city_SE3_egovehicle.feather")  # rows repeated
+    poses.iloc[0, poses.columns.get_loc("tx_m")] += 1.0
+    feather.write_feather(poses, split / "log-two-poses/city_SE3_egovehicle.feather")
     summary, file = convert(tmp_path)
     assert {s.scene for s in file} == {"log-good"}
     for reason in (
         "no map/log_map_archive_*.json",
         "no poses at",
         "cannot be used",
+        f"it has several poses for the time {poses.timestamp_ns.iloc[0]} ns",
         "no calibration of the ring cameras",
     ):
         assert reason in summary
-    for name in ("log-no-map", "log-bad-json", "log-no-poses", "log-bad-poses", "log-no-calib"):
+    for name in bad:
         assert name in summary
 
 

@@ -177,6 +177,11 @@ def test_logs_of_a_list_come_from_all_official_folders(tmp_path: Path):
     assert file.meta.split_list.startswith("own@")
     with pytest.raises(ValueError, match="split 'own' has no part 'test'"):
         convert_argoverse2(replace(options, split="test"))
+    write_log(tmp_path / "sensor" / "val" / "log-a")  # not read, because there is a folder val
+    write_log(tmp_path / "val" / "log-a")
+    with pytest.raises(ValueError, match=r"train/log-a and .*val/log-a are one log: remove one"):
+        convert_argoverse2(options)
+    shutil.rmtree(tmp_path / "val" / "log-a")
     own.write_text(json.dumps({"train": ["log-a"], "val": ["log-a"]}))
     with pytest.raises(ValueError, match="log-a is in both train and val; list each log"):
         convert_argoverse2(options)

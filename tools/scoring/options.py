@@ -11,6 +11,13 @@ from gsmap.utils.cli import CommandParser, output_file
 from gsmap.utils.model_facts import LAW_NAMES
 from gsmap.utils.shards import add_shard_options
 
+# Options that only apply together with another one, which is their value here.
+_NEEDED_OPTIONS = {
+    "law": "uncertainty",
+    "prior_elements": "prior",
+    "reliability": "uncertainty",
+    "tracks": "consistency",
+}
 
 def parse_args(description: str | None, argv: list[str] | None = None) -> argparse.Namespace:
     """Read the options of the command and check their combinations.
@@ -231,18 +238,13 @@ def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace
         parser.error("name either a result file or --prior")
     if args.hard and args.thresholds:
         parser.error("--hard and --thresholds exclude each other")
-    if args.tracks and not args.consistency:
-        parser.error("--tracks needs --consistency")
-    if args.reliability and not args.uncertainty:
-        parser.error("--reliability needs --uncertainty")
-    if args.law and not args.uncertainty:
-        parser.error("--law needs --uncertainty")
+    for name, needed in _NEEDED_OPTIONS.items():
+        if getattr(args, name) is not None and not getattr(args, needed):
+            parser.error(f"--{name.replace('_', '-')} needs --{needed}")
     if args.seed is not None and args.bootstrap is None and not args.against:
         parser.error("--seed is for resamples: give --bootstrap or --against, or leave it out")
     if args.prior:
         check_prior(parser, args)
-    elif args.prior_elements is not None:
-        parser.error("--prior-elements needs --prior")
     check_changes(parser, args)
     if args.by == DISTANCE and args.dim == 3:
         parser.error("--by distance is in the plane: leave out --dim 3")

@@ -75,8 +75,8 @@ class Argoverse2Log:
 
         Raises:
             FileNotFoundError: If the pose table is missing.
-            ValueError: If the table is damaged or empty, a translation is not finite, or a
-                quaternion does not have the length 1.
+            ValueError: If the table is damaged or empty, a translation is not finite, a quaternion
+                does not have the length 1, or a time has several poses.
         """
         path = self.log_dir / POSE_TABLE
         if not path.is_file():
@@ -84,8 +84,12 @@ class Argoverse2Log:
         # `explain_errors` adds the path and the advice to errors about the content of the file.
         with explain_errors(path, "download the log again"):
             table = _read_feather(path)
-            # The first pose of each time is kept.
-            table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
+            # A row may be repeated, but a time has one pose.
+            table = table.drop_duplicates().sort_values("timestamp_ns")
+            repeated = table["timestamp_ns"].duplicated()
+            if repeated.any():
+                time = table["timestamp_ns"][repeated].iloc[0]
+                raise InputError(f"it has several poses for the time {time} ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
             # The quaternion of a rotation has the length 1. The comparison is also False for NaN.
@@ -225,6 +229,7 @@ def find_all_logs(root: Path) -> list[Path]:
 
     Raises:
         FileNotFoundError: If there is no log.
+        ValueError: If a log is in two splits.
     """
     log_dirs = []
     for split in ("train", "val", "test"):
@@ -233,6 +238,11 @@ def find_all_logs(root: Path) -> list[Path]:
             log_dirs += _logs_of_split(folder)
     if not log_dirs:
         raise FileNotFoundError(f"no Argoverse 2 log in the folders train, val and test of {root}.")
+    folder_of_log: dict[str, Path] = {}
+    for log_dir in log_dirs:
+        other = folder_of_log.setdefault(log_dir.name, log_dir)
+        if other != log_dir:
+            raise InputError(f"{other} and {log_dir} are one log: remove one of the folders.")
     return log_dirs
 
 
