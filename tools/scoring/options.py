@@ -19,6 +19,7 @@ _NEEDED_OPTIONS = {
     "tracks": "consistency",
 }
 
+
 def parse_args(description: str | None, argv: list[str] | None = None) -> argparse.Namespace:
     """Read the options of the command and check their combinations.
 
