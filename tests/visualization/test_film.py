@@ -115,6 +115,7 @@ def test_elements_of_other_classes_are_not_drawn_and_lines_may_be_empty(tmp_path
         path = tmp_path / f"{len(more)}.mp4"
         said = film.write_drive_film(path, annotations, {"a": file}, max_frames=1, width_px=480)
         assert ("; 1 element of other classes left out" in said) == bool(more)
+        assert ("; 1 element of fewer than two points left out" in said) == bool(more)
         drawn.append(frames_of(path)[0])
     np.testing.assert_array_equal(*drawn)
 

@@ -104,8 +104,8 @@ def write_drive_film(
         width_px: Width of the film in pixels.
 
     Returns:
-        Text with the name of the drive, the number of frames and the path, and the number of
-        elements whose class the annotation file lacks.
+        Text with the name of the drive, the number of frames and the path, and the numbers of
+        elements whose class the annotation file lacks, or that have fewer than two points.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -152,13 +152,30 @@ def write_drive_film(
     )
     write_film(path, pictures, times_ns)
     text = f"{scene}, {format_count(len(rows), 'frame')}: {path}"
+    shown = [frames[: len(rows)] for frames in frames_by_result.values()]
+    return text + _omissions(shown)
+
+
+def _omissions(frames_of_results: Iterable[Sequence[DriveFrame]]) -> str:
+    """Text with the numbers of predictions that cannot be drawn; empty if there are none."""
     num_unknown = 0
-    for frames in frames_by_result.values():
-        for frame in frames[: len(rows)]:
-            num_unknown += int((frame.predictions.labels < 0).sum())
+    num_short = 0
+    for frames in frames_of_results:
+        for frame in frames:
+            is_known = frame.predictions.labels >= 0
+            num_unknown += int((~is_known).sum())
+            num_short += int((is_known & ~_has_length(frame)).sum())
+    text = ""
     if num_unknown:
         text += f"; {format_count(num_unknown, 'element')} of other classes left out"
+    if num_short:
+        text += f"; {format_count(num_short, 'element')} of fewer than two points left out"
     return text
+
+
+def _has_length(frame: DriveFrame) -> np.ndarray:
+    """Whether each of the n predictions of a frame has at least two points. (n,)"""
+    return np.array([len(line) > 1 for line in frame.predictions.polylines], dtype=bool)
 
 
 def _draw_frames(
@@ -220,7 +237,7 @@ def _result_panel(name: str, frame: DriveFrame, score_thr: float) -> BEVPanel:
     """
     is_drawn = frame.predictions.confidence >= score_thr
     is_drawn &= frame.predictions.labels >= 0  # -1: a class that the annotation file lacks
-    is_drawn &= np.array([len(line) > 1 for line in frame.predictions.polylines], dtype=bool)
+    is_drawn &= _has_length(frame)
     predictions = frame.predictions.select(is_drawn)
     if frame.track_ids is None:
         return BEVPanel(name, predictions)
