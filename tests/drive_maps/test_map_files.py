@@ -305,6 +305,24 @@ def test_a_lanelet2_map_of_another_program_is_read_by_its_types(tmp_path):
     assert found.labels.tolist() == [2]
 
 
+@pytest.mark.parametrize(
+    ("kind", "unused"),
+    [
+        ("curbstone", {"boundary that is part of a crosswalk": 2}),
+        ("line_thin", {"divider that is part of a crosswalk": 2}),
+        ("pedestrian_marking", {}),
+        ("virtual", {}),
+    ],
+)
+def test_lines_of_other_classes_that_bound_a_crosswalk_are_counted(tmp_path, kind, unused):
+    path = tmp_path / "town.osm"
+    crosswalk = relation(20, {"left": 10, "right": 11}, type="lanelet", subtype="crosswalk")
+    path.write_text(osm(way(10, [1, 2], type=kind) + way(11, [4, 3], type=kind) + crosswalk))
+    found, counted = read_map(path, CLASSES)
+    assert found.labels.tolist() == [1]
+    assert dict(counted) == unused
+
+
 def test_nodes_without_local_positions_need_an_origin(tmp_path):
     path = tmp_path / "town.osm"
     nodes = "<node id='5' lat='48.26' lon='11.6702'/>"
@@ -365,6 +383,17 @@ HOSTILE_OSM = {
     "a crosswalk without a bound": (
         osm(relation(20, {"left": 12}, type="lanelet", subtype="crosswalk")),
         "crosswalk '20' has no left bound",
+    ),
+    "a crosswalk with a bound in two pieces": (
+        osm(
+            way(12, [1, 2])
+            + way(13, [2, 3])
+            + way(14, [4, 3])
+            + "<relation id='20'><member type='way' ref='12' role='left'/>"
+            "<member type='way' ref='13' role='left'/><member type='way' ref='14' role='right'/>"
+            "<tag k='subtype' v='crosswalk'/></relation>"
+        ),
+        "crosswalk '20' has several left bounds",
     ),
     "one bound of many crosswalks": (
         osm(

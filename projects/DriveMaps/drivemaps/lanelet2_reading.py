@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 from xml.parsers import expat
@@ -75,12 +76,17 @@ class _Relation(NamedTuple):
     """Lanelet, area or regulatory element.
 
     Attributes:
-        way_of_role: ID of each member that is a way, by its role, such as ``left``.
+        ways_of_role: IDs of the members that are ways, by their role, such as ``left``.
         tags: Tags by their keys; untrusted.
     """
 
-    way_of_role: dict[str, str]
+    ways_of_role: dict[str, list[str]]
     tags: dict[str, str]
+
+    @property
+    def way_ids(self) -> list[str]:
+        """IDs of the members that are ways."""
+        return list(chain.from_iterable(self.ways_of_role.values()))
 
 
 def read_lanelet2(
@@ -110,8 +116,8 @@ def read_lanelet2(
     Raises:
         FileNotFoundError: If the file does not exist.
         ValueError: If the file is malformed or too large, a number is not finite or out of range,
-            a node or a bound of a crosswalk is missing, degrees have no origin, or no element can
-            be used.
+            a node or a bound of a crosswalk is missing, a crosswalk has several left or right
+            bounds, degrees have no origin, or no element can be used.
         RuntimeError: If an origin is given and ``pyproj`` is missing.
     """
     path = Path(path)
@@ -127,9 +133,10 @@ def read_lanelet2(
     bound_ids: set[str] = set()
     for relation_id, relation in crosswalks.items():
         lines.append((_CROSSING, parser.ring_of(relation_id, relation)))
-        bound_ids.update(relation.way_of_role.values())
+        bound_ids.update(relation.way_ids)
     for way_id, way in parser.ways.items():
         if way_id in bound_ids:
+            collector.unused.update(_unused_bound(way, classes))
             continue
         tags = way.tags if rule else _with_class(way.tags, classes)
         class_name = collector.class_of(tags)  # None for an element that is only counted
@@ -167,6 +174,13 @@ def _with_class(tags: Mapping[str, str], classes: Sequence[str]) -> dict[str, st
     return {CLASS_KEY: f"{kind}/{subtype}" if subtype else kind}
 
 
+def _unused_bound(way: _Way, classes: Sequence[str]) -> list[str]:
+    """Reason to count the bound of a crosswalk, if it has the type of another class (a kerb)."""
+    name = _with_class(way.tags, classes)[CLASS_KEY]
+    is_other = name in classes and name != _CROSSING
+    return [f"{name} that is part of a crosswalk"] if is_other else []
+
+
 class _Parser:
     """Parser of the nodes, ways and relations of an OSM file, which expat reads in blocks.
 
@@ -195,7 +209,7 @@ class _Parser:
         self._attributes: dict[str, str] = {}
         self._tags: dict[str, str] = {}
         self._references: list[str] = []
-        self._way_of_role: dict[str, str] = {}
+        self._ways_of_role: dict[str, list[str]] = {}
 
     def read(self) -> None:
         """Read the file.
@@ -243,7 +257,7 @@ class _Parser:
             self._attributes = attributes
             self._tags = {}
             self._references = []
-            self._way_of_role = {}
+            self._ways_of_role = {}
         elif name == "tag":
             key = self._required(attributes, "k", owner=name)
             self._tags[key] = self._required(attributes, "v", owner=name)
@@ -251,7 +265,8 @@ class _Parser:
             self._references.append(self._required(attributes, "ref", owner=name))
         elif name == "member" and attributes.get("type") == "way":
             role = attributes.get("role", "")
-            self._way_of_role[role] = self._required(attributes, "ref", owner=name)
+            way_id = self._required(attributes, "ref", owner=name)
+            self._ways_of_role.setdefault(role, []).append(way_id)
 
     def _end(self, name: str) -> None:
         """Store a node, a way or a relation at the end of its XML element."""
@@ -276,7 +291,7 @@ class _Parser:
         else:
             table = self.relations
             is_new = element_id not in table
-            self.relations[element_id] = _Relation(self._way_of_role, tags=self._tags)
+            self.relations[element_id] = _Relation(self._ways_of_role, tags=self._tags)
         if not is_new:
             raise self._error(f"it has {name} {element_id!r:.40} twice")
 
@@ -405,11 +420,15 @@ class _Parser:
             IDs of the nodes, the first one also at the end.
 
         Raises:
-            ValueError: If a bound or a node is missing, or crosswalks share their bounds too often.
+            ValueError: If a bound or a node is missing, a side has several bounds, or crosswalks
+                share their bounds too often.
         """
         bounds = []
         for role in ("left", "right"):
-            way = self.ways.get(crosswalk.way_of_role.get(role, ""))
+            way_ids = crosswalk.ways_of_role.get(role, [])
+            if len(way_ids) > 1:
+                raise self._error(f"crosswalk {lanelet_id!r:.40} has several {role} bounds")
+            way = self.ways.get(way_ids[0]) if way_ids else None
             if way is None or not way.nodes:
                 raise self._error(f"crosswalk {lanelet_id!r:.40} has no {role} bound")
             bounds.append(way.nodes)
