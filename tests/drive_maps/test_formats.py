@@ -326,6 +326,9 @@ def test_poses_in_a_grid_lie_where_the_grid_says():
         ("EPSG:31468", (4_470_315.0, 5_329_181.0), True),
         ("EPSG:25832+7837", (693_566.0, 5_330_684.0), True),
         ("EPSG:31288", (176_675.0, 5_227_960.0), True),  # longitudes from Ferro
+        ("EPSG:5514", (-744_430.0, -1_043_628.0), True),
+        ("EPSG:2180", (636_640.0, 483_432.0), True),
+        ("EPSG:2048", (55_496.0, 3_752_731.0), True),  # westing and southing: turned, not mirrored
         ("EPSG:32650", (1e12, 0.0), False),
         ("EPSG:32650", (math.nan, 0.0), False),
     ],
@@ -350,10 +353,12 @@ def test_local_positions_are_no_coordinates_of_a_grid(crs, position, is_inside):
         ("EPSG:2056", (1_239_333.0, 2_680_270.0), "outside of .*x must be the easting"),
         ("EPSG:3857", (1_291_306.0, 6_123_507.0), "differs by 50% .*such as its UTM zone"),
         ("EPSG:3034", (4_115_192.0, 2_382_244.0), "differs by 3% .*such as its UTM zone"),
+        ("EPSG:5513", (1_043_628.0, 744_430.0), "mirrored, .* such as EPSG:5514"),
+        ("EPSG:2065", (1_043_628.0, 744_430.0), "mirrored"),  # longitudes from Ferro
     ],
 )
-def test_swapped_axes_and_stretched_grids_are_refused(crs, position, message):
-    """Munich and Zurich, with northing and easting exchanged, and in grids without true metres."""
+def test_swapped_mirrored_and_stretched_grids_are_refused(crs, position, message):
+    """Munich, Zurich, Prague: exchanged or mirrored axes, and grids without true metres."""
     pytest.importorskip("pyproj", reason="pip install -e .[maps]")
     with pytest.raises(ValueError, match=message):
         MapGrid(crs).require_inside(np.array([position]), "a")

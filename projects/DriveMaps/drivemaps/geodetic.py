@@ -158,7 +158,8 @@ class MapGrid:
             ValueError: If a position has no longitude and latitude, if it is outside of the area of
                 the grid (by more than 5 degrees, if a coordinate is larger than 100 km), or if a
                 metre of the grid differs there by more than 1 percent from a metre on the ground,
-                as in Web Mercator.
+                as in Web Mercator, or if the axes of the grid are mirrored, as the southing and
+                westing of EPSG:5513.
         """
         points = np.asarray(positions)[:, :2]
         pyproj = import_extra("pyproj", "maps")
@@ -190,10 +191,20 @@ class MapGrid:
             )
         geod = pyproj.Geod(ellps="WGS84")
         stretch = np.zeros(len(points))
+        headings_deg = []  # of x and of y, clockwise from north
         for step_m in ((_STEP_M, 0.0), (0.0, _STEP_M)):  # along x and along y
             next_lon_deg, next_lat_deg = self.lon_lat(points + step_m).T
-            _, _, ground_m = geod.inv(lon_deg, lat_deg, next_lon_deg, next_lat_deg)
+            heading_deg, _, ground_m = geod.inv(lon_deg, lat_deg, next_lon_deg, next_lat_deg)
             stretch = np.fmax(stretch, np.abs(_STEP_M / ground_m - 1.0))
+            headings_deg.append(heading_deg)
+        x_deg, y_deg = headings_deg
+        # x is a quarter turn clockwise from y, unless the axes are the southing and the westing.
+        if np.sin(np.radians(x_deg - y_deg)).min(initial=1.0) < 0:
+            raise InputError(
+                f"{where}: maps in {self.crs} ({system.name}) are mirrored, because its axes are "
+                "not the easting and the northing: transform the poses to the grid that has them, "
+                "such as EPSG:5514 in place of EPSG:5513."
+            )
         if stretch.max(initial=0.0) > _MAX_STRETCH:
             x, y = points[stretch.argmax()]
             raise InputError(
