@@ -224,6 +224,7 @@ def test_coordinates_of_another_system_are_refused(tmp_path, crs, coordinates, m
         (["kind", "kerb=wall"], r"a class of \['divider', 'ped_crossing', 'boundary'\]"),
         (["kind", "=divider"], "must be VALUE=CLASS"),
         (["", "a=divider"], "must have a name"),
+        (["kind", "a=divider", "a=boundary"], "'a' has the classes 'divider' and 'boundary'"),
     ],
 )
 def test_wrong_words_for_classes_are_named(words, message):

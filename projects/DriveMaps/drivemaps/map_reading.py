@@ -73,7 +73,7 @@ class ClassRule:
 
         Raises:
             ValueError: If the first word is empty, a word after it is not ``VALUE=CLASS``, or a
-                class does not exist.
+                class does not exist, or if a value has two classes.
         """
         key, *pairs = words
         class_of = {}
@@ -85,7 +85,11 @@ class ClassRule:
                     f"a value of {key!r} and its class must be VALUE=CLASS with a class of "
                     f"{list(classes)}, got {pair!r}."
                 )
-            class_of[value] = name
+            if class_of.setdefault(value, name) != name:
+                raise InputError(
+                    f"the value {value!r} has the classes {class_of[value]!r} and {name!r}: give "
+                    "one of them."
+                )
         return cls(key, class_of or None)
 
 
