@@ -26,7 +26,7 @@ import numpy as np
 from drivemaps.change import Pass
 from drivemaps.changes import find_changes, summarize_changes, write_changes
 from drivemaps.config import MergeConfig
-from drivemaps.drive import Drive, read_drive
+from drivemaps.drive import Drive, read_drive, require_scenes
 from drivemaps.geodetic import MapGrid, MapOrigin, known_origin, require_near
 from drivemaps.geojson import write_geojson
 from drivemaps.lanelet2 import SPEED_LIMIT_KMH, write_lanelet2
@@ -64,6 +64,14 @@ _CHANGES = "changes"  # name of the file of changes, without a suffix
 # Bytes that every output of this command contains. A file without them belongs to another program.
 _MARK = b"gsmap"  # in maps
 _MARK_OF_SCORES = b'"merged"'  # in scores
+# Options without effect if the results, or the folder of the maps, are not given.
+_OPTIONS_OF = {
+    "results": (
+        "join", "score_thr", "min_confidence", "min_area_confidence", "no_gaussians",
+        "allow_other_split",
+    ),
+    "--out": ("formats", "speed_limit", "data_root"),
+}  # fmt: skip
 # Package that a format needs, and the extra of GSMap that installs it (`pip install -e .[viz]`).
 EXTRAS = {"rrd": ("rerun", "viz"), "mcap": ("foxglove", "viz"), "mp4": ("av", "viz")}
 
@@ -188,6 +196,11 @@ def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace
     if args.changes and args.join:
         parser.error("--changes compares each drive with the old map: leave --join out")
     check_prior_options(parser, args)
+    for source, names in _OPTIONS_OF.items():
+        is_given = getattr(args, source.strip("-")) is not None
+        for name in names:
+            if not is_given and getattr(args, name) != parser.get_default(name):
+                parser.error(f"--{name.replace('_', '-')} needs {source}: give both, or neither")
     if args.map_classes and not (args.map or args.changes):
         parser.error("--map-classes is for --map and --changes")
 
@@ -435,12 +448,13 @@ def score(passes: list[Pass], ann: AnnotationFile, out: Path) -> None:
     print(f"figures: {out / 'scores.json'}")
 
 
-def place_of(ann: AnnotationFile, scenes: Iterable[str]) -> str:
+def place_of(ann: AnnotationFile, scenes: Sequence[str]) -> str:
     """Name of the place of drives, the ``map_name`` of their samples.
 
     Raises:
         ValueError: If the drives are in different places, or do not exist.
     """
+    require_scenes(ann, scenes)
     chosen = set(scenes)
     places = set()
     for scene, place in zip(ann.column("scene"), ann.column("map_name"), strict=True):

@@ -404,6 +404,10 @@ def test_changes_since_an_old_map_are_written(files, tmp_path, capsys):
         (["r.json", "--prior", "p", "--changes", "a.osm"], "--changes goes to the folder --out"),
         (["r.json", "--out", "b", "--map-classes", "a"], "--map-classes is for"),
         (["r.json", "--prior", "p", "--gaussians", "--no-gaussians"], "give one of them"),
+        (["r.json", "--prior", "p", "--formats", "osm"], "--formats needs --out: give both"),
+        (["r.json", "--prior", "p", "--speed-limit", "30"], "--speed-limit needs --out"),
+        (["--map", "a.osm", "--prior", "p", "--join"], "--join needs results: give both"),
+        (["--map", "a.osm", "--prior", "p", "--min-confidence", "0.5"], "--min-confidence needs"),
     ],
 )
 def test_words_that_do_not_belong_together_are_named(options, message, capsys):
@@ -421,7 +425,9 @@ def test_earlier_maps_of_two_places_and_maps_of_none_are_refused(files, tmp_path
     with pytest.raises(ValueError, match=r"the drives lie in \['town', 'village'\]: .*--scene"):
         main(words)
     main([*words, "--scene", "scene"])
-    with pytest.raises(ValueError, match=r"the drives lie in \[\]"):
-        main([*words, "--scene", "nowhere"])
+    from_map = ["--map", "a.geojson", *words[1:]]
+    for unknown in ([*words, "--scene", "nowhere"], [*from_map, "--scene", "scene", "nowhere"]):
+        with pytest.raises(ValueError, match=r"two.arrow has no scene 'nowhere', but \['other'"):
+            main(unknown)
     with pytest.raises(ValueError, match="is no map: its name must end in"):
         main([*words, "--scene", "scene", "--map", str(results.with_suffix(".arrow"))])

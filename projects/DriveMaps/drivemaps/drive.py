@@ -182,6 +182,15 @@ class Drive:
         return shapely.Polygon(frame.to_global(corners))
 
 
+def require_scenes(annotations: AnnotationFile, scenes: Iterable[str]) -> None:
+    """Raise ValueError if an annotation file lacks one of the scenes."""
+    known_scenes = set(annotations.column("scene"))
+    for scene in scenes:
+        if scene not in known_scenes:
+            some_scenes = sorted(known_scenes)[:5]
+            raise InputError(f"{annotations.path} has no scene {scene!r}, but {some_scenes} ...")
+
+
 def read_drive(
     annotations: AnnotationFile,
     scenes: Sequence[str],
@@ -204,12 +213,9 @@ def read_drive(
     Raises:
         ValueError: If the file lacks a scene, or no sample of a scene has a map.
     """
+    require_scenes(annotations, scenes)
     samples_of_scene: dict[str, list[MapSample]] = {scene: [] for scene in scenes}
     scene_of_row = annotations.column("scene")  # name of the scene of each sample of the file
-    for scene in scenes:
-        if scene not in scene_of_row:
-            some_scenes = sorted(set(scene_of_row))[:5]
-            raise InputError(f"{annotations.path} has no scene {scene!r}, but {some_scenes} ...")
     for row, scene in enumerate(scene_of_row):
         if scene in samples_of_scene:
             sample = annotations[row]  # reads the sample from the file
