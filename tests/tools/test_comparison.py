@@ -322,8 +322,26 @@ def test_rules_of_both_metrics_may_change(minicity_annotations):
     assert chamfer.thresholds == (0.2, 0.5)
     assert raster.polygon_classes == ()
     assert raster.grid.y_range == (-30.0, 30.0)
-    with pytest.raises(ValueError, match=r"no metric has the setting \['threshold'\]"):
-        evaluator_for(path, {"threshold": 1})
+    assert evaluator_for(path, {"px_per_m": 4}).metrics[1].size_px == (120, 240)
+    for wrong in ({"threshold": 1}, {"grid": 3}):  # the grid is the one of the file
+        with pytest.raises(ValueError, match=r"no metric has the setting '\w+'; there are"):
+            evaluator_for(path, wrong)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("ground_truth_points", 2.5),
+        ("px_per_m", "a"),
+        ("px_per_m", True),
+        ("dilation_px", 7.5),
+        ("resample_predictions", "no"),
+        ("thresholds", 0.5),
+    ],
+)
+def test_rules_of_another_type_are_refused(minicity_annotations, key, value):
+    with pytest.raises(ValueError, match=f"{key} must be a value such as .*, got {value!r}"):
+        evaluator_for(minicity_annotations["val"], {key: value})
 
 
 class PrintingRun(Run):

@@ -217,28 +217,32 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
             ``ground_truth_points``, the number of points to which ground truth is resampled.
 
     Raises:
-        ValueError: If there is no such field.
+        ValueError: If there is no such field, or a value is of another type or out of range.
     """
     meta = AnnotationFile(annotations).meta
     settings: dict[str, Any] = {"classes": meta.classes}
     settings["grid"] = BEVGrid(meta.x_range, meta.y_range)
+    examples: dict[str, Any] = {"classes": meta.classes, "ground_truth_points": 20}
+    for config in (ChamferConfig, RasterConfig):
+        for field in fields(config):
+            if field.name not in settings:
+                examples[field.name] = field.default
     for key, value in changes.items():
-        settings[key] = tuple(value) if isinstance(value, list) else value
+        if key not in examples:
+            raise InputError(f"no metric has the setting {key!r}; there are {sorted(examples)}.")
+        setting = tuple(value) if isinstance(value, list) else value
+        expected = (int, float) if isinstance(examples[key], float) else (type(examples[key]),)
+        if type(setting) not in expected:  # True is no number
+            raise InputError(f"{key} must be a value such as {examples[key]}, got {value!r:.40}.")
+        settings[key] = setting
     points = settings.pop("ground_truth_points", None)
     configs = []
-    allowed = {"ground_truth_points"}
     for config in (ChamferConfig, RasterConfig):
         config_settings = {}
         for field in fields(config):
-            allowed.add(field.name)
             if field.name in settings:
                 config_settings[field.name] = settings[field.name]
         configs.append(config(**config_settings))
-    unknown = settings.keys() - allowed
-    if unknown:
-        raise InputError(
-            f"no metric has the setting {sorted(unknown)}; there are {sorted(allowed)}."
-        )
     return MapEvaluator(*configs, ground_truth_points=points)
 
 
