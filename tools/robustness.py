@@ -82,6 +82,11 @@ def add_corruption(settings: Any, kind: str, severity: int, seed: int) -> dict[s
         return dict(settings)
     steps = list(settings["pipeline"])
     types = [step["type"] for step in steps]
+    if "LoadCameraImages" not in types:
+        raise InputError(
+            f"the test pipeline {types} has no step LoadCameraImages, whose images are corrupted: "
+            "give a config that loads images by it."
+        )
     load_index = types.index("LoadCameraImages")
     if kind == _DELAYED:
         step = {
@@ -267,6 +272,8 @@ def main() -> str:
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = load_model(args.config, checkpoint, device=device, cfg_options=args.cfg_options)
+    if model.img_backbone is None:
+        raise InputError(f"{args.config} uses no images to corrupt: give a model with cameras.")
     if not args.allow_other_split:
         require_own_split(checkpoint, model.cfg.test_dataloader.dataset)
     if model.temporal is not None and args.samples:

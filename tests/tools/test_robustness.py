@@ -33,6 +33,21 @@ def test_corruptions_come_right_after_the_images_and_delays_before(tool):
     files = {"ann_file": "a.arrow", "data_root": "d"}
     assert late == [{"type": "DelayCameras", **files, "severity": 2, "seed": 7}, load, scale]
     assert tool.add_corruption(settings, "none", 1, 7) == settings
+    with pytest.raises(
+        ValueError, match=r"pipeline \['ScaleImages'\] has no step LoadCameraImages"
+    ):
+        tool.add_corruption({**settings, "pipeline": [scale]}, "fog", 3, 7)
+
+
+def test_a_model_without_cameras_is_refused(tool, tmp_path, monkeypatch):
+    (tmp_path / "a.pth").touch()
+    monkeypatch.setattr(
+        "gsmap.apis.loading.load_model", lambda *_, **__: Namespace(img_backbone=None)
+    )
+    words = ["maptr_pointpillars_minicity", str(tmp_path / "a.pth"), "--out", str(tmp_path / "r")]
+    monkeypatch.setattr("sys.argv", ["robustness.py", *words])
+    with pytest.raises(ValueError, match="maptr_pointpillars_minicity uses no images to corrupt"):
+        tool.main()
 
 
 def test_every_kind_is_registered_and_in_the_table(tool):
