@@ -58,11 +58,24 @@ def parse_args() -> argparse.Namespace:
     return args
 
 
-def require_held_out(trained: Mapping[str, Any], ground_truth: Path) -> None:
-    """Refuse samples of the split that the model was trained on, if both splits are known."""
+def require_held_out(trained: Mapping[str, Any], train_file: str, ground_truth: Path) -> None:
+    """Refuse samples of the split that the model was trained on, if both splits are known.
+
+    Args:
+        trained: Metadata of the training's data set. Checkpoints that ship have none.
+        train_file: Annotation file of the training in the config, used without metadata.
+        ground_truth: Ground truth of the samples.
+
+    Raises:
+        ValueError: If the samples are of the training.
+    """
     if ground_truth.suffix.lower() != ".json":  # a JSON file names no split
         meta = AnnotationFile(ground_truth).meta
-        if (trained.get("dataset"), trained.get("split")) == (meta.dataset, meta.split):
+        is_of_training = Path(train_file).name == ground_truth.name
+        if trained:
+            trained_split = (trained.get("dataset"), trained.get("split"))
+            is_of_training = trained_split == (meta.dataset, meta.split)
+        if is_of_training:
             raise InputError(
                 f"{ground_truth} holds the split {meta.split!r}, which the model was trained on: "
                 "its errors there are smaller than elsewhere; give results of another split."
@@ -84,7 +97,9 @@ def main() -> str:
 
     cfg = read_config(args.config)
     source = read_checked(args.checkpoint)
-    require_held_out(source.dataset_meta, args.ground_truth)
+    train_data = (cfg.get("train_dataloader") or {}).get("dataset", {})
+    train_file = str(train_data.get("ann_file", ""))
+    require_held_out(source.dataset_meta, train_file, args.ground_truth)
     with building(cfg):  # adds the name of the config to errors
         # The config gets the model settings with which the checkpoint was trained. A calibrated
         # checkpoint has the factors of its sigmas as `temperatures` of the head.

@@ -136,6 +136,12 @@ def test_sigmas_are_not_fitted_on_the_split_of_the_training(files, tmp_path, mon
         else:
             calibrate()
         assert target.exists() == (split == "val")
+    path = tmp_path / "gsmap_minicity_train.arrow"  # of the config: the checkpoint names no split
+    (tmp_path / "train.arrow").rename(path)
+    words = [NAME, NAME, str(files[0]), str(path), str(tmp_path / "a.pth")]
+    monkeypatch.setattr("sys.argv", ["calibrate.py", *words])
+    with pytest.raises(ValueError, match="split 'train', which the model was trained on"):
+        calibrate()
 
 
 @pytest.mark.parametrize("sigmas", ["0", "-1", "3.1", "nan"])
