@@ -26,7 +26,7 @@ from typing import Any
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.analysis.calibration import LAWS, fit_factors, matched_vertices
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig
-from gsmap.evaluation.core.file_evaluation import SamplePairs
+from gsmap.evaluation.core.file_evaluation import SamplePairs, joined_notes
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
@@ -142,6 +142,7 @@ def main() -> str:
     lines = []
     for name, (along, across) in zip(classes, factors, strict=True):
         lines.append(f"{name}: sigma {along:.2f} times along, {across:.2f} times across")
+    lines += joined_notes(pairs.notes(counts_heights=False))
     lines.append(f"by the {args.law} law, {args.sigmas:g} sigma: {args.target}")
     return "\n".join(lines)
 

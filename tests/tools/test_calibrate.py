@@ -98,6 +98,19 @@ def test_the_split_that_a_model_was_trained_on_and_the_law_are_kept(files, tmp_p
     assert meta["calibration"] == found.calibration == {"law": "laplace", "sigmas": 1.0}
 
 
+def test_samples_that_one_file_lacks_are_counted(files, tmp_path, monkeypatch):
+    results, truth = (json.loads(path.read_text()) for path in files)
+    results["results"] = results["results"][:30]
+    truth["GTs"] = truth["GTs"][10:]
+    for path, content in zip(files, (results, truth), strict=True):
+        path.write_text(json.dumps(content))
+    words = ["calibrate.py", NAME, NAME, *map(str, files), str(tmp_path / "a.pth")]
+    monkeypatch.setattr("sys.argv", words)
+    said = calibrate()
+    assert "10 samples have no results, such as 't30'" in said
+    assert "10 results have no ground truth, such as 't0': left out\n" in said
+
+
 def test_predictions_of_another_checkpoint_are_refused(files, tmp_path, monkeypatch):
     source, target = tmp_path / "trained.pth", tmp_path / "calibrated.pth"
     torch.save({"state_dict": read_checked(NAME).state}, source)

@@ -78,7 +78,10 @@ def matched_vertices(samples: Iterable[Sample], config: ChamferConfig) -> Vertic
     for sample in samples:
         lines += _vertices_of_sample(sample, config)
     if not lines:
-        raise InputError("no prediction matches: there is no vertex to measure.")
+        raise InputError(
+            "no prediction matches, so there is no vertex to measure: give the results and the "
+            "ground truth of equal samples."
+        )
     return Vertices(
         labels=np.concatenate([line.labels for line in lines]),
         errors=np.concatenate([line.errors for line in lines]),
