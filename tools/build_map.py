@@ -483,7 +483,7 @@ def open_map(path: Path, args: argparse.Namespace, ann: AnnotationFile, place: s
     print(f"{format_count(len(file.elements), 'element')}: {path}")
     if file.unused:
         print(f"not used: {describe_unused(file.unused)}")
-    if not lies_near(file.elements, ann, place):
+    if len(file.elements) and not lies_near(file.elements, ann, place):
         print(
             f"{path} has no element within {_NEAR_M:g} m of the samples of {args.ann}: its "
             "coordinates may be of another frame."

@@ -344,6 +344,10 @@ def test_a_prior_is_made_of_maps_of_other_programs(files, tmp_path, capsys):
     words = ["--map", str(tmp_path / name), "--ann", str(ann), "--prior", str(prior)]
     main([*words, *rule, *elsewhere])
     assert f"{name} has no element within 1000 m of the samples of {ann}" in capsys.readouterr().out
+    (tmp_path / name).write_text('{"crs": null, "features": []}')
+    main(words)
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"0 elements: {tmp_path / name}\nprior of town, 0 tiles: ")
 
 
 def test_changes_since_an_old_map_are_written(files, tmp_path, capsys):

@@ -36,6 +36,9 @@ def test_a_live_map_fuses_elements_and_refuses_to_write_at_its_start(tmp_path):
         inferencer.live(intrinsics, cam_from_frame, frame="lidar", prior=prior, update_prior=True)
     with pytest.raises(ValueError, match="there is no prior to update: give one"):
         inferencer.live(intrinsics, cam_from_frame, update_prior=True)
+    for closed in ("town.prior", [prior]):
+        with pytest.raises(TypeError, match=r"a prior is opened by .*open_prior\(FILE\), got"):
+            inferencer.live(intrinsics, cam_from_frame, prior=closed)
     dataset = inferencer.dataset([sample], tmp_path)
     with pytest.raises(ValueError, match="there is no prior to update: give one"):
         next(inferencer.predict(dataset, update_priors=True))

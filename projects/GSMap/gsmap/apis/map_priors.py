@@ -37,10 +37,16 @@ def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> 
         prior module of the model takes the prior of each sample from them.
 
     Raises:
+        TypeError: If a prior is none, such as the path of its file.
         ValueError: If the model takes no prior, if a prior does not fit it, if two priors are of
             one place, or if ``update`` is set and there is no prior or the model writes to none.
     """
     require_prior(model)
+    for prior in priors:
+        if not hasattr(prior, "settings"):
+            raise TypeError(
+                f"a prior is opened by gsmap.prior.open_prior(FILE), got {prior!r:.60}."
+            )
     if update and not priors:
         raise InputError("there is no prior to update: give one, or leave the update out.")
     return model.prior.maps_of(priors, update=update)
