@@ -15,6 +15,7 @@ from processes import run_tool
 from gsmap.apis.map_priors import open_priors
 from gsmap.engine.launch import read_config
 from gsmap.prior import LastSeen, MapPrior, PriorSettings, open_prior
+from gsmap.utils.inputs import protect_inputs
 from gsmap.utils.shards import digest
 from tools import build_map, infer
 
@@ -53,7 +54,8 @@ def test_a_prior_is_made_updated_and_only_read(model, minicity_annotations, tmp_
 
     def run(name, *words):
         out = tmp_path / f"{name}.json"
-        infer.main([drive, "--model", *model, "--out", str(out), *map(str, words)])
+        with protect_inputs():  # as `run_command`
+            infer.main([drive, "--model", *model, "--out", str(out), *map(str, words)])
         return lines_of(out)
 
     first = run("first", "--prior", path, "--update-prior")

@@ -23,6 +23,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
+from gsmap.utils.inputs import forget_input
 
 MEMORY_BYTES = 100 << 20
 """Default of ``memory_bytes``, the largest total size of the tiles in memory."""
@@ -137,6 +138,8 @@ class MapPrior:
             # A file that `load` has reserved for this prior must not be reserved a second time.
             is_reserved = self._owned_path == path.resolve()
             owner = None if is_reserved else reserve_file(path)
+            if is_reserved:
+                forget_input(path)
             try:
                 with atomic_write(path, mode="wb") as file:
                     write_tiles(

@@ -197,6 +197,13 @@ def forget_output(path: Path) -> None:
         _Command.outputs.pop(identity, None)
 
 
+def forget_input(path: Path) -> None:
+    """Allow the replacing of a file that was declared as an input and that the command updates."""
+    identity = _identity(path) if _Command.inputs else None
+    if identity is not None:
+        _Command.inputs.pop(identity, None)
+
+
 def _on_event(event: str, arguments: tuple[Any, ...]) -> None:
     """Audit hook that checks each file that Python opens for reading or that SQLite opens."""
     if not _Command.is_running:
