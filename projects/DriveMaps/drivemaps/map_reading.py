@@ -76,7 +76,7 @@ class ClassRule:
                 class does not exist, or if a value has two classes.
         """
         key, *pairs = words
-        class_of = {}
+        class_of: dict[str, str] = {}
         for pair in pairs:
             # The last "=" separates the class, because a value may contain this character.
             value, separator, name = pair.rpartition("=")
