@@ -106,6 +106,8 @@ def test_bad_input_is_refused_before_anything_trains(tiny_config, protocol, text
         "train_dataloader.dataset.shuffle_images_seed=1",
         "train_dataloader.sampler.shuffle=False",
         "default_hooks.sync_buffers=None",
+        "load_from=gsmap_r18_minicity",
+        "auto_scale_lr.enable=True",
     ],
 )
 def test_what_is_no_part_of_the_model_makes_another_run_too(tiny_config, protocol, option):
@@ -114,6 +116,17 @@ def test_what_is_no_part_of_the_model_makes_another_run_too(tiny_config, protoco
     (one.folder / "settings.json").write_text(json.dumps(other.settings))
     with pytest.raises(ValueError, match="holds a run of other settings"):
         plan(entries(tiny_config, "a=CONFIG"), protocol)
+
+
+def test_a_work_folder_of_an_earlier_version_is_continued(tiny_config, protocol):
+    config = entries(tiny_config, "a=CONFIG,load_from=gsmap_r18_minicity")
+    (run, _) = plan(config, protocol)
+    run.folder.mkdir(parents=True)
+    settings = {**run.settings}
+    for key in ("auto_scale_lr", "load_from", "sync_bn"):
+        settings.pop(key)
+    (run.folder / "settings.json").write_text(json.dumps(settings))
+    assert len(plan(config, protocol)) == 2
 
 
 def test_a_budget_is_whole_epochs_and_a_folder_one_run(tiny_config, protocol):

@@ -47,7 +47,11 @@ _TRAINING_KEYS = (  # settings of a config that affect the training
     "randomness",
     "default_hooks",
     "custom_hooks",
+    "auto_scale_lr",
+    "sync_bn",
 )
+# Settings that the work folders of earlier versions do not have.
+_ADDED_KEYS = ("auto_scale_lr", "load_from", "sync_bn")
 
 
 class Entry(NamedTuple):
@@ -344,6 +348,7 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     settings["init"] = None
     if initial_weights is not None:
         settings["init"] = _digest(initial_weights)
+    settings["load_from"] = _weights_of(cfg)
     folder = protocol.out.resolve() / entry.name / f"seed_{seed}"
     return Run(
         name=entry.name,
@@ -356,6 +361,14 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
         processes=processes,
         settings=settings,
     )
+
+
+def _weights_of(cfg: Config) -> str | None:
+    """Digest of the checkpoint that the training starts from, or its address; None without one."""
+    source = cfg.get("load_from")
+    if source is None or "://" in source:
+        return source
+    return _digest(find_checkpoint(source))
 
 
 def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int) -> int:
@@ -417,8 +430,9 @@ def _check_folder(run: Run) -> None:
     """Raise an InputError if the work folder belongs to another run or has other content."""
     path = run.folder / SETTINGS
     if path.is_file():
+        unknown = {key: run.settings[key] for key in _ADDED_KEYS}
         _refuse_differences(
-            differences(_read_settings(path), plain(run.settings)),
+            differences({**unknown, **_read_settings(path)}, plain(run.settings)),
             fault=f"{run.folder} holds a run of other settings",
             remedy="Give another --out, or remove it.",
         )
