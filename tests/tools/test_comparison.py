@@ -145,6 +145,35 @@ def test_a_budget_is_whole_epochs_and_a_folder_one_run(tiny_config, protocol):
         plan(config, replace(protocol, options=("optim_wrapper.optimizer.lr=0.001",)))
 
 
+@pytest.mark.parametrize(
+    ("cores", "loader", "steps"),
+    [
+        (1, "", 2),
+        (1, "drop_last=True", 1),
+        (2, "drop_last=True", 2),  # a sampler gives each of two processes two samples
+        (1, "sampler=dict(_delete_=True, type='StreamTrainSampler', slots=2)", 1),
+        (2, "sampler=dict(_delete_=True, type='StreamTrainSampler', slots=1)", 1),
+        (1, "num_batch_per_epoch=3", 3),
+    ],
+)
+def test_an_epoch_has_the_steps_of_its_data_loader(
+    cores, loader, steps, tiny_config, protocol, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    leaf = tmp_path / "leaf.py"
+    leaf.write_text(f"_base_ = '{tiny_config}'\ntrain_dataloader = dict({loader})\n")
+    config = entries(leaf, "a=CONFIG,train_dataloader.dataset.indices=[0,1,0]")
+    (run, _) = plan(config, replace(protocol, budget=6))
+    assert run.epochs == 6 / steps
+
+
+def test_an_epoch_without_a_whole_batch_is_refused(tiny_config, protocol):
+    config = entries(tiny_config, "a=CONFIG,train_dataloader.drop_last=True")
+    with pytest.raises(ValueError, match="an epoch of a has no iteration: train_dataload"):
+        plan(config, replace(protocol, batch=64))
+
+
 def test_a_comparison_keeps_its_number_of_processes(tiny_config, protocol, tmp_path, monkeypatch):
     """Runs on a GPU are tabulated on a node without one; runs on a CPU cannot go on on a GPU."""
     config = entries(tiny_config, "a=CONFIG")

@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from mmdet3d.registry import DATASETS, METRICS, MODELS
+from mmdet3d.registry import METRICS, MODELS
 from mmengine.config import Config
+from mmengine.runner import Runner
 
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.named_models import find_checkpoint
@@ -375,13 +376,14 @@ def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int)
     """Number of epochs that have the optimizer steps of the budget.
 
     Raises:
-        ValueError: If the budget is not a whole number of epochs.
+        ValueError: If the budget is not a whole number of epochs, or an epoch has no step.
     """
-    dataset = single_dataset_of(cfg, part="train", purpose="a comparison")
-    with building(cfg):  # adds the name of the config to errors
-        num_samples = len(DATASETS.build(dataset))
-    samples_per_process = math.ceil(num_samples / processes)
-    steps_per_epoch = math.ceil(samples_per_process / cfg.train_dataloader.batch_size)
+    steps_per_epoch = _count_steps(cfg, processes=processes)
+    if steps_per_epoch == 0:
+        raise InputError(
+            f"an epoch of {entry.name} has no iteration: train_dataloader.drop_last leaves out its "
+            f"only batch, of less than {protocol.batch} samples. Give a smaller --batch."
+        )
     epochs = round(protocol.budget / steps_per_epoch) or 1  # at least 1
     if epochs * steps_per_epoch != protocol.budget:
         raise InputError(
@@ -389,6 +391,23 @@ def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int)
             f" ({steps_per_epoch} iterations each): give {epochs * steps_per_epoch}."
         )
     return epochs
+
+
+def _count_steps(cfg: Config, processes: int) -> int:
+    """Number of optimizer steps of an epoch, by the data loader of the training."""
+    single_dataset_of(cfg, part="train", purpose="a comparison")  # raises an error for wrappers
+    settings = cfg.train_dataloader.to_dict()  # a copy
+    settings |= {"num_workers": 0, "persistent_workers": False, "prefetch_factor": None}
+    batch_size = settings["batch_size"]
+    # This process builds the loader of all processes together, which have more streams.
+    settings["batch_size"] *= processes
+    with building(cfg):  # adds the name of the config to errors
+        if "slots" in settings["sampler"]:
+            settings["sampler"]["slots"] *= processes
+        loader = Runner.build_dataloader(settings, seed=0)
+    samples_per_process = math.ceil(len(loader.sampler) / processes)
+    rounded = math.floor if loader.drop_last else math.ceil
+    return rounded(samples_per_process / batch_size)
 
 
 def _data_settings(cfg: Config) -> dict[str, Any]:
