@@ -60,7 +60,8 @@ def parse_args() -> argparse.Namespace:
         action=EachOnce,
         default=[],
         metavar="NAME=DIR",
-        help="work folders of finished runs",
+        help="work folders of finished runs, with metrics.json (tools/test.py --metrics-out), and "
+        "results.json (--out) for precision-recall curves and --rescore",
     )
     parser.add_argument(
         "--rescore",

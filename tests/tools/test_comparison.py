@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import sys
 import time
 from dataclasses import replace
@@ -18,6 +19,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.torchrun import OWN_WORDS
 from gsmap.evaluation.core.results_json import write_results
 from gsmap.utils.faults import user_message
+from tools.compare import main as compare
 
 CLASSES = ("divider", "boundary")
 
@@ -345,6 +347,18 @@ def test_a_test_of_some_samples_is_scored_again_on_these(minicity_annotations, t
     result.figures["chamfer/num_samples"] = 2.0
     with pytest.raises(ValueError, match=r"results.json has 1 samples of .* and 2 were tested"):
         rescore(result, {})
+
+
+def test_a_run_without_predictions_has_a_table_and_no_curves(tmp_path, monkeypatch, capsys):
+    folder = finished(tmp_path / "a", 0.2, 0.2)
+    words = ["--runs", f"A={folder}", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["compare.py", *words])
+    assert "| A | 1 | 20.0 |" in compare()
+    missing = r"a/results\.json is missing, the predictions of the test \(tools/test\.py --out\)"
+    assert re.search(rf"a: no precision-recall curves\. .*{missing}", capsys.readouterr().out)
+    monkeypatch.setattr(sys, "argv", ["compare.py", *words, "--rescore", "thresholds=[0.2]"])
+    with pytest.raises(FileNotFoundError, match=missing):
+        compare()
 
 
 def test_seconds_of_a_test_are_those_of_a_batch_without_loading(tmp_path):

@@ -21,8 +21,10 @@ from gsmap.evaluation.core.report import MetricReport, flat_metrics
 from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
+from gsmap.utils.faults import user_message
 from gsmap.utils.files import read_json
 from gsmap.utils.parallel import default_workers
+from gsmap.utils.progress import Progress
 from mapdata.upstream_configs.fields import Fields
 from mapdata.upstream_configs.reader import read_assignments
 
@@ -252,15 +254,21 @@ def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
     The samples are those of the test, which may be a part of the annotation file (``indices``).
 
     Raises:
+        FileNotFoundError: If there are no predictions or no annotation file.
         ValueError: If the config in the folder is missing or names no annotation file, if the
             results cannot be evaluated, or if they have other samples than the test.
     """
+    predictions = result.folder / "results.json"
+    if not predictions.is_file():
+        raise FileNotFoundError(
+            f"{predictions} is missing, the predictions of the test (tools/test.py --out): test "
+            "the model again."
+        )
     dataset = _config(result.folder).section("test_dataloader.dataset")
     if "ann_file" not in dataset:
         raise InputError(f"{result.folder}: its config does not name the data of its test.")
     annotations = Path(str(dataset.get("data_root", "")), str(dataset["ann_file"]))
     evaluator = evaluator_for(annotations, changes)
-    predictions = result.folder / "results.json"
     # The test has compared the split of the model with the split of the annotations.
     pairs = SamplePairs(
         predictions,
@@ -287,7 +295,7 @@ def apply_rescoring(
     """Score runs again.
 
     With changed rules, all runs are scored. Otherwise one run of each config is scored, for its
-    precision-recall curves.
+    precision-recall curves; a run that cannot be scored is named in a note.
 
     Args:
         results: Results of all runs. Their figures are replaced if rules change.
@@ -299,7 +307,14 @@ def apply_rescoring(
     reports: dict[str, list[MetricReport]] = {}
     for result in results:
         if result.figures and (changes or result.name not in reports):
-            rescored = rescore(result, changes)
+            try:
+                rescored = rescore(result, changes)
+            except (InputError, FileNotFoundError) as error:
+                if changes:
+                    raise
+                note = user_message(error)
+                Progress.write(f"{result.folder}: no precision-recall curves. {note}")
+                continue
             reports.setdefault(result.name, rescored)
             if changes:
                 result.figures = flat_metrics(rescored)
