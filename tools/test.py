@@ -118,6 +118,11 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
         cfg.test_dataloader.dataset.shuffle_images_seed = args.shuffle_images
 
 
+def plain_value(value: Any) -> Any:
+    """Convert a value of a user's metric for JSON: numbers and arrays stay numbers, else a text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
 def main() -> None:
     args = parse_args()
     if args.eval == [] and not args.out:
@@ -149,7 +154,7 @@ def main() -> None:
             use_priors(model, args.prior, stack)
         metrics = runner.test()
     if args.metrics_out and runner.rank == 0:
-        write_text(args.metrics_out, json.dumps(metrics, indent=2))
+        write_text(args.metrics_out, json.dumps(metrics, indent=2, default=plain_value))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from mmengine.runner import FlexibleRunner
@@ -16,6 +18,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from waiting import waiting_config
 
 from gsmap.checkpoints.reading import read_checked
+from gsmap.engine.run_log import MapRunner
+from tools import test as test_tool
 from tools.train import main as train
 
 pytestmark = pytest.mark.faults
@@ -225,6 +229,16 @@ def test_the_config_chooses_the_runner(tiny_config, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", [*words, "--cfg-options", "runner_type=FlexibleRunner"])
     train()
     assert [type(runner) for runner in built] == [FlexibleRunner]
+
+
+def test_figures_of_a_users_metric_are_written(tmp_path, monkeypatch):
+    figures = {"a": np.float32(0.5), "b": torch.tensor(3), "c": np.arange(2), "d": tmp_path}
+    runner = SimpleNamespace(rank=0, test=lambda: figures)
+    monkeypatch.setattr(MapRunner, "from_cfg", lambda _: runner)
+    out = tmp_path / "metrics.json"
+    monkeypatch.setattr(sys, "argv", ["test.py", "gsmap_r18_minicity", "--metrics-out", str(out)])
+    test_tool.main()
+    assert json.loads(out.read_text()) == {"a": 0.5, "b": 3, "c": [0, 1], "d": str(tmp_path)}
 
 
 def test_a_missing_checkpoint_is_named(tiny_config):
