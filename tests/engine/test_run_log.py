@@ -8,14 +8,22 @@ import numpy as np
 import pytest
 import torch
 from mmengine.config import Config
+from mmengine.dataset import ClassBalancedDataset, ConcatDataset, RepeatDataset
 from mmengine.evaluator import Evaluator
 from mmengine.evaluator.metric import DumpResults
 from mmengine.hooks import Hook
 from mmengine.runner import Runner
 from torch.utils.data import ConcatDataset as TorchConcat
+from torch.utils.data import Subset
 
 import gsmap.registered  # noqa: F401
-from gsmap.engine.run_log import MapRunner, _describe_data, _missed_elements_warning
+from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+from gsmap.engine.run_log import (
+    MapRunner,
+    _describe_data,
+    _element_counts,
+    _missed_elements_warning,
+)
 
 
 @pytest.mark.parametrize("level", ["INFO", "DEBUG"])
@@ -65,8 +73,8 @@ def test_the_config_of_a_run_replaces_no_other_file(kind, tmp_path):
 
 def run_with(counts, queries):
     """Return a runner whose training samples have so many elements, and its model."""
-    annotations = SimpleNamespace(instance_counts=lambda: np.array(counts))
-    loader = SimpleNamespace(dataset=SimpleNamespace(annotations=annotations))
+    dataset = SimpleNamespace(instance_counts=lambda: np.array(counts))
+    loader = SimpleNamespace(dataset=dataset)
     head = SimpleNamespace(query_groups=[SimpleNamespace(num=queries)])
     return SimpleNamespace(train_dataloader=loader), SimpleNamespace(map_head=head)
 
@@ -88,7 +96,6 @@ class Drives:
 
     def __init__(self, ann_file, width):
         self.ann_file = ann_file
-        self.annotations = SimpleNamespace(instance_counts=lambda: np.array([1, width]))
         self._camera = SimpleNamespace(name="front", width=width, height=9)
 
     def __len__(self):
@@ -97,9 +104,12 @@ class Drives:
     def sample(self, index):
         return SimpleNamespace(cameras=[self._camera])
 
+    def instance_counts(self):
+        return np.array([1, self._camera.width])
+
 
 def test_data_sets_inside_of_others_are_described():
-    repeated = SimpleNamespace(dataset=Drives("b.arrow", 32))
+    repeated = Subset(Drives("b.arrow", 32), [1])
     train = TorchConcat([Drives("a.arrow", 16), TorchConcat([Drives("a.arrow", 16)])])
     train.datasets.append(repeated)
     runner, model = run_with([], 20)
@@ -112,6 +122,24 @@ def test_data_sets_inside_of_others_are_described():
     assert lines["cameras"] == "1, their files 16 x 9 and 32 x 9 and 64 x 9"
     assert lines["elements"] == "up to 32 in a sample"
     assert "12 elements can never be found" in _missed_elements_warning(runner, model)
+
+
+def test_only_elements_of_samples_in_use_are_counted(minicity_annotations):
+    """Wrappers repeat samples or leave them out."""
+    dataset = VectorizedMapDataset(minicity_annotations["train"])
+    counts = dataset.annotations.instance_counts().tolist()
+    part = dataset.get_subset([1])
+    balanced = ClassBalancedDataset(dataset, oversample_thr=1e-3)
+    balanced.repeat_indices = [0, 1, 1]
+    for used, expected in (
+        (part, counts[1:]),
+        (Subset(dataset, [1]), counts[1:]),
+        (RepeatDataset(part, times=2), counts[1:] * 2),
+        (Subset(RepeatDataset(dataset, times=2), [3]), counts[1:]),
+        (balanced, [*counts, counts[1]]),
+        (ConcatDataset([part, dataset]), [counts[1], *counts]),
+    ):
+        assert _element_counts(used).tolist() == expected
 
 
 @pytest.mark.parametrize("loop", ["train", "test"])

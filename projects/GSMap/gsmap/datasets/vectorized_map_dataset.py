@@ -289,6 +289,14 @@ class VectorizedMapDataset(BaseDataset):
         row = super().get_data_info(idx)["row"]  # opens the file on first use
         return self.annotations[row]
 
+    def instance_counts(self) -> np.ndarray:
+        """Return the number of map elements of each sample, -1 without ground truth. (samples,)"""
+        self.full_init()
+        rows = []
+        for index in range(len(self)):
+            rows.append(super().get_data_info(index)["row"])
+        return self.annotations.instance_counts()[rows]
+
     def scenes(self) -> list[list[int]]:
         """Return the indices of the samples of each scene in the order of their times.
 

@@ -254,26 +254,32 @@ def _describe_data(runner: Runner) -> dict[str, str]:
         f"x from {x_min:g} to {x_max:g} m, y from {y_min:g} to {y_max:g} m; "
         f"{', '.join(meta['classes'])}"
     )
-    most_elements = _element_counts(runner.train_dataloader).max()
+    most_elements = _element_counts(runner.train_dataloader.dataset).max()
     lines["elements"] = f"up to {most_elements} in a sample"
     return lines
 
 
-def _element_counts(loader: Any) -> np.ndarray:
+def _element_counts(dataset: Any) -> np.ndarray:
     """Return the number of map elements of each sample, 0 if unknown. (number of samples,)"""
-    counts = []
-    for dataset in innermost(loader.dataset):
-        counts.append(dataset.annotations.instance_counts())
-    return np.maximum(np.concatenate(counts), 0)
+    if hasattr(dataset, "datasets"):
+        return np.concatenate([_element_counts(inner) for inner in dataset.datasets])
+    if hasattr(dataset, "dataset"):
+        counts = _element_counts(dataset.dataset)
+        # Samples of `RepeatDataset`, or else of `ClassBalancedDataset` or of torch's `Subset`.
+        indices = np.arange(len(dataset)) % len(counts)
+        for name in ("repeat_indices", "indices"):
+            indices = getattr(dataset, name, indices)
+        return counts[np.asarray(indices)]
+    return np.maximum(dataset.instance_counts(), 0)
 
 
 def _missed_elements_warning(runner: Runner, model: Any) -> str | None:
     """Return a warning if training samples have more elements than the model has queries."""
     groups = getattr(getattr(model, "map_head", None), "query_groups", None)
     datasets = innermost(runner.train_dataloader.dataset)
-    if not groups or not all(hasattr(dataset, "annotations") for dataset in datasets):
+    if not groups or not all(hasattr(dataset, "instance_counts") for dataset in datasets):
         return None
-    counts = _element_counts(runner.train_dataloader)
+    counts = _element_counts(runner.train_dataloader.dataset)
     queries = groups[0].num  # only the first group is used in prediction
     excess = np.maximum(counts - queries, 0)
     if not excess.any():
