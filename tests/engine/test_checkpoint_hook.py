@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -360,6 +361,34 @@ def test_a_resumed_run_has_the_random_numbers_of_the_stopped_one(loader, options
         found = torch.load(work / "epoch_4.pth", weights_only=False)
         wanted = torch.load(tmp_path / "whole/epoch_4.pth", weights_only=False)
         assert torch.equal(found["state_dict"]["weight"], wanted["state_dict"]["weight"])
+
+
+def test_a_schedule_that_holds_a_function_is_resumed(tmp_path):
+    cycle = {"type": "OneCycleLR", "eta_max": 0.2, "total_steps": 8, "by_epoch": False}
+    learn(tmp_path / "whole", 4, schedule=cycle)
+    learn(tmp_path / "resumed", 4, tmp_path / "whole/epoch_2.pth", schedule=cycle)
+    found = read_checked(tmp_path / "resumed/epoch_4.pth").state["weight"]
+    assert torch.equal(found, read_checked(tmp_path / "whole/epoch_4.pth").state["weight"])
+    log = "".join(path.read_text() for path in tmp_path.glob("resumed/*/*.log"))
+    assert "goes on with the settings of" not in log
+
+
+@pytest.mark.parametrize(
+    ("value", "named"),
+    [
+        (Path("a"), "mine of the checkpoint is a PosixPath"),
+        ({"x": [1, lambda: 0]}, r"mine\.x\.1 of the checkpoint is a function"),
+    ],
+)
+def test_what_loading_would_refuse_is_not_saved(value, named, tmp_path):
+    class Setting(Learner):
+        def forward(self, *args, **kwargs):
+            MessageHub.get_current_instance().update_info("mine", value)
+            return super().forward(*args, **kwargs)
+
+    with pytest.raises(ValueError, match=rf"message_hub\.runtime_info\.{named}"):
+        learn(tmp_path, 2, model=Setting)
+    assert not list(tmp_path.glob("*.pth"))
 
 
 class Augmented(torch.utils.data.Dataset):

@@ -30,7 +30,9 @@ from gsmap.engine.random_states import (
 )
 from gsmap.engine.resuming import (
     check_optimizer_state,
+    check_readable,
     check_resumable,
+    drop_functions,
     ignored_settings,
     refusing_state,
 )
@@ -171,6 +173,7 @@ class AtomicCheckpointHook(CheckpointHook):
         self._resumed_state: dict[str, Any] | None = None  # to set when the training goes on
         self._state_before_val: dict[str, Any] | None = None  # None outside of a validation
         self._saved_states: list[dict[str, Any]] | None = None  # of all ranks, during a save
+        self._has_saved = False
 
     def before_run(self, runner: Runner) -> None:
         """Register the safe checkpoint loaders; mmengine loads a checkpoint after this call."""
@@ -247,8 +250,11 @@ class AtomicCheckpointHook(CheckpointHook):
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
         """Store the model's settings, the size of the scaled images and the presence of signals.
 
+        Functions are removed from the states of the schedulers, because loading refuses them.
+
         Raises:
             FloatingPointError: If a loss or a weight is not finite.
+            ValueError: If the first checkpoint of a run has entries that loading would refuse.
         """
         finish_checks(runner)  # raises the error of a loss that was not finite
         nonfinite_keys = []
@@ -265,6 +271,10 @@ class AtomicCheckpointHook(CheckpointHook):
         checkpoint["meta"].update(_image_facts(runner))
         if self._saved_states is not None:
             checkpoint[RANDOM_STATES] = self._saved_states
+        drop_functions(checkpoint)
+        if not self._has_saved:
+            check_readable(checkpoint)
+            self._has_saved = True
 
     def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
         """Save a checkpoint, and write its path to the file `NEWEST`.

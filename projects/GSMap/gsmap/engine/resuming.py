@@ -1,23 +1,29 @@
 """Checks that a training can be resumed from a checkpoint."""
 
+import io
 import math
+import pickle
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import chain
 from typing import Any
 
+import torch
 from mmengine.logging import HistoryBuffer
 from mmengine.optim import OptimWrapper, _ParamScheduler
 from mmengine.runner import EpochBasedTrainLoop, Runner
 from torch import Tensor
 from torch.optim import Optimizer
 
+from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import plain
 from gsmap.utils.errors import InputError
 
 _PARTS = ("meta", "message_hub", "optimizer")  # parts of a checkpoint that mmengine resumes from
 # Parts of the state of the message hub, in which mmengine stores logged values and the progress.
 _HUB_KEYS = ("log_scalars", "runtime_info", "resumed_keys")
+# Parts of a checkpoint to which data sets, hooks and schedules of a user add entries
+_OPEN_PARTS = ("meta", "message_hub", "param_schedulers")
 _SEED_COUNT = 2**32  # seeds that numpy accepts
 # Entries of the state of a schedule that are no settings: its progress and its values so far.
 _SCHEDULE_PROGRESS = {"last_step", "_global_step", "_last_value", "base_values", "verbose"}
@@ -47,6 +53,65 @@ def refusing_state(path: object) -> Iterator[None]:
     except (LookupError, TypeError, AttributeError, AssertionError) as error:
         reason = f"its state does not fit ({type(error).__name__}: {error})"
         raise refusal(path, reason=reason) from error
+
+
+def drop_functions(checkpoint: dict[str, Any]) -> None:
+    """Remove functions from the states of the schedulers of a checkpoint, in place.
+
+    Loading refuses a function in a file. A resumed scheduler has its functions from the config.
+    """
+    schedules = checkpoint.get("param_schedulers", [])
+    # A training with several optimizers has a list for each of them, by name.
+    for states in schedules.values() if isinstance(schedules, dict) else [schedules]:
+        for index, state in enumerate(states):
+            states[index] = {name: value for name, value in state.items() if not callable(value)}
+
+
+def check_readable(checkpoint: Mapping[str, Any]) -> None:
+    """Require that the parts with entries of a user can be read without running code from a file.
+
+    Raises:
+        ValueError: If a part has an entry that `torch.load` would refuse with ``weights_only``.
+    """
+    for part in _OPEN_PARTS:
+        value = checkpoint.get(part)
+        if _is_readable(value):
+            continue
+        name, entry = _find_unreadable(value, name=part)
+        raise InputError(
+            f"{name} of the checkpoint is a {type(entry).__name__}, with which the checkpoint "
+            "could not be loaded: let what sets it, such as a hook or a data set, store numbers, "
+            "texts, tensors, or lists and dictionaries of them."
+        )
+
+
+def _is_readable(value: Any) -> bool:
+    """Whether a value can be saved, and loaded again without running code."""
+    file = io.BytesIO()
+    try:
+        torch.save(value, file)
+        file.seek(0)
+        with torch.serialization.safe_globals(mmengine_globals()):
+            torch.load(file, weights_only=True)
+    except (pickle.PickleError, AttributeError, TypeError):
+        return False
+    return True
+
+
+def _find_unreadable(value: Any, name: str) -> tuple[str, Any]:
+    """Return the innermost entry of an unreadable value that is unreadable, after its dotted name.
+
+    Args:
+        value: Value that `_is_readable` refuses.
+        name: Dotted name of the value.
+    """
+    if isinstance(value, list | tuple):
+        value = dict(enumerate(value))
+    if isinstance(value, Mapping):
+        for key, entry in value.items():
+            if not _is_readable(entry):
+                return _find_unreadable(entry, name=f"{name}.{key}")
+    return name, value
 
 
 def check_resumable(checkpoint: Mapping[str, Any], runner: Runner, path: object) -> None:
@@ -142,7 +207,8 @@ def ignored_settings(checkpoint: Mapping[str, Any], runner: Runner) -> list[str]
         states = checkpoint.get("param_schedulers") or []
         for saved, schedule in zip(states, runner.param_schedulers, strict=False):
             for name, value in schedule.state_dict().items():
-                if name not in _SCHEDULE_PROGRESS and saved.get(name) != value:
+                is_setting = name not in _SCHEDULE_PROGRESS and not callable(value)
+                if is_setting and saved.get(name) != value:
                     kind = type(schedule).__name__
                     texts.append(f"{kind}.{name} {saved.get(name)} (config: {value})")
     return list(dict.fromkeys(texts))  # without repetitions: groups often differ alike
