@@ -250,6 +250,16 @@ def test_a_validation_that_a_kill_prevented_is_made_up_for(tmp_path):
     assert learn(tmp_path, 3, tmp_path / "epoch_2.pth") == 2  # that of epoch 2, then 3's
 
 
+def test_a_new_run_names_the_checkpoints_that_it_replaces(tmp_path):
+    learn(tmp_path, 1)
+    learn(tmp_path, 2, tmp_path / "epoch_1.pth")
+    logs = "".join(path.read_text() for path in tmp_path.glob("*/*.log"))
+    assert "of an earlier run" not in logs
+    learn(tmp_path, 3)
+    logs = "".join(path.read_text() for path in tmp_path.glob("*/*.log"))
+    assert logs.count("of an earlier run (epoch_1.pth, epoch_2.pth), which this new run") == 1
+
+
 @pytest.mark.parametrize(
     ("part", "values", "reason"),
     [

@@ -1,4 +1,5 @@
 import argparse
+import os
 import re
 from pathlib import Path
 
@@ -266,6 +267,20 @@ def test_the_newest_whole_checkpoint_is_found_whatever_is_noted(tmp_path, capsys
     (tmp_path / "epoch_10.pth").write_bytes(content[:100])
     assert newest_checkpoint(tmp_path).name == "epoch_9.pth"
     assert "epoch_10.pth is damaged and is passed over" in capsys.readouterr().out
+
+
+def test_checkpoints_that_an_earlier_run_left_are_passed_over(tmp_path, capsys):
+    for number, seconds in ((1, 90), (2, 100), (3, 110), (5, 50), (6, 60)):
+        path = tmp_path / f"epoch_{number}.pth"
+        torch.save({"state_dict": {"w": torch.ones(1)}}, path)
+        os.utime(path, (seconds, seconds))
+    noted = tmp_path / "last_checkpoint"
+    for text in (b"", b"\xff/..", b"../keys", b"elsewhere/epoch_9.pth"):
+        noted.write_bytes(text)
+        assert newest_checkpoint(tmp_path).name == "epoch_6.pth"
+    noted.write_text("elsewhere/epoch_2.pth")
+    assert newest_checkpoint(tmp_path).name == "epoch_3.pth"  # saved, and killed before its note
+    assert "epoch_5.pth, epoch_6.pth left out, from an earlier run" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
 from gsmap.checkpoints.unwrapping import unwrap
 from gsmap.engine.figures import finish_checks
+from gsmap.engine.launch import NEWEST, numbered_checkpoints
 from gsmap.engine.optimizers import fit_optimizer_state
 from gsmap.engine.random_states import (
     RANDOM_STATES,
@@ -49,7 +50,6 @@ from gsmap.utils.split_lists import (
 )
 from gsmap.utils.worker_seeds import seed_epoch
 
-NEWEST = "last_checkpoint"  # file in a work folder, written by mmengine
 VALIDATED = "last_validation"  # file in a work folder: iteration of the latest validation
 
 
@@ -134,6 +134,16 @@ def _warn_of_differences(runner: Runner) -> None:
         runner.logger.warning(
             "Some training data sets have vehicle signals and others have none: inference will "
             "compute missing signals from the poses."
+        )
+
+
+def _warn_of_earlier_run(runner: Runner) -> None:
+    """Log a warning if the work folder of a new run has checkpoints."""
+    names = sorted(path.name for path in numbered_checkpoints(runner.work_dir))
+    if names:
+        runner.logger.warning(
+            f"{runner.work_dir} has checkpoints of an earlier run ({summarize_names(names)}), "
+            "which this new run replaces in turn; --resume would continue the earlier run."
         )
 
 
@@ -324,6 +334,8 @@ class AtomicCheckpointHook(CheckpointHook):
         super().before_train(runner)  # restores the paths of the best checkpoints when resuming
         self._forget_foreign_best(runner)
         _warn_of_differences(runner)
+        if not runner._resume:
+            _warn_of_earlier_run(runner)
         if isinstance(runner.val_loop, BaseLoop):
             self._check_split(_metainfo(runner.train_dataloader), loop=runner.val_loop)
         loop = runner.train_loop

@@ -39,6 +39,7 @@ _EXTRA_KEYS = (
     *_COPIED_KEYS, "custom_imports", "find_unused_parameters", "model_wrapper_cfg", "runner_type",
     "images_on_device", "strategy", "sync_bn",
 )  # fmt: skip
+NEWEST = "last_checkpoint"  # file in a work folder with the path of its latest checkpoint
 _MAX_WORKERS = 16
 # Endings of the top-level keys whose values must be dictionaries
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
@@ -240,7 +241,7 @@ def newest_checkpoint(
     """Find the newest valid checkpoint of a run.
 
     A checkpoint is valid if it is undamaged and ``read`` accepts it. A warning is logged for each
-    invalid checkpoint that is newer than the result.
+    invalid checkpoint that is newer than the result, and for those that an earlier run left.
 
     Args:
         work_dir: Folder of the run.
@@ -251,11 +252,14 @@ def newest_checkpoint(
     Returns:
         Path of the checkpoint, or None if there is no valid one.
     """
-    numbers: dict[Path, int] = {}  # number of the epoch or iteration of each checkpoint
-    for path in Path(work_dir).glob("*.pth"):
-        match = re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name)
-        if match:
-            numbers[path] = int(match[1])
+    numbers = numbered_checkpoints(work_dir)
+    earlier = _left_by_earlier_run(numbers, noted=Path(work_dir, NEWEST))
+    if earlier:
+        names = ", ".join(path.name for path in earlier)
+        text = f"{work_dir}: {names} left out, from an earlier run than the latest checkpoint."
+        print_log(text, level=logging.WARNING)
+    for path in earlier:
+        del numbers[path]
     # A run counts either epochs or iterations, so its numbers can be compared.
     newest_first = sorted(numbers, key=numbers.__getitem__, reverse=True)
     for path in newest_first:
@@ -269,6 +273,40 @@ def newest_checkpoint(
             reason = f"{error} It is passed over."
         print_log(reason, level=logging.WARNING)
     return None
+
+
+def numbered_checkpoints(work_dir: str | Path) -> dict[Path, int]:
+    """Return the number of the epoch or iteration of each checkpoint in a work folder."""
+    numbers: dict[Path, int] = {}
+    for path in Path(work_dir).glob("*.pth"):
+        match = re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name)
+        if match:
+            numbers[path] = int(match[1])
+    return numbers
+
+
+def _left_by_earlier_run(numbers: dict[Path, int], noted: Path) -> list[Path]:
+    """Return the checkpoints of an earlier run that a newer run has not replaced.
+
+    They have a higher number than the latest checkpoint and are older. A newer file with a higher
+    number was saved by a run that was killed before it noted its name.
+
+    Args:
+        numbers: Number of each checkpoint.
+        noted: File with the path of the latest checkpoint; its text is untrusted.
+    """
+    if not noted.is_file():
+        return []
+    name = Path(noted.read_text(encoding="utf-8", errors="replace")).name
+    latest = noted.with_name(name) if name else noted
+    if latest not in numbers:
+        return []
+    written = latest.stat().st_mtime_ns
+    earlier = []
+    for path, number in numbers.items():
+        if number > numbers[latest] and path.stat().st_mtime_ns < written:
+            earlier.append(path)
+    return sorted(earlier, key=numbers.__getitem__)
 
 
 def _is_undamaged_zip(path: Path) -> bool:
