@@ -60,7 +60,8 @@ def choose_start(cfg: Config, resume: str | None) -> None:
             becomes True if the run continues with the optimizer and the number of iterations in
             the checkpoint, and False if it takes only the weights.
         resume: Value of ``--resume``: a checkpoint; ``auto`` for the newest one in the work folder,
-            if there is one; or None to start a training, from ``cfg.load_from`` if it is set.
+            if there is one; or None for the settings of the config: ``load_from`` is the checkpoint
+            to resume from if ``resume`` is True, and otherwise has the weights to start from.
 
     Raises:
         FileNotFoundError: If the checkpoint does not exist.
@@ -70,6 +71,8 @@ def choose_start(cfg: Config, resume: str | None) -> None:
     from gsmap.checkpoints.reading import read_weights
     from gsmap.engine.launch import newest_checkpoint
 
+    if resume is None and cfg.get("resume"):
+        resume = cfg.get("load_from") or "auto"
     if resume == "auto":
         newest = newest_checkpoint(cfg.work_dir, read_weights)  # skips files that cannot be read
         if newest is None and is_first_rank():

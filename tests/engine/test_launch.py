@@ -140,6 +140,12 @@ def test_a_section_that_is_none_is_refused(tmp_path):
         read_config(tmp_path / "a.py")
 
 
+def test_a_checkpoint_to_resume_from_is_no_value_of_resume():
+    read_config(Config({"resume": True}))
+    with pytest.raises(ValueError, match=r"resume must be True .*, got 'a\.pth'; .*load_from"):
+        read_config(Config({"resume": "a.pth"}))
+
+
 def test_own_values_start_with_an_underscore():
     read_config(Config({"_num_points": 20}))
     with pytest.raises(ValueError, match="start with '_'"):
@@ -235,11 +241,37 @@ def test_a_loop_that_would_empty_the_memory_in_each_iteration_is_refused(name, l
     cfg.param_scheduler = []
     check_config(cfg)
     cfg.train_cfg = loop
+    cfg.default_hooks.checkpoint.by_epoch = False
     with pytest.raises(ValueError, match=r"train_cfg counts iterations, .*'EpochBasedTrainLoop'"):
         check_config(cfg)
     cfg.model.temporal = None
     cfg.model.prior = None
     check_config(cfg)
+
+
+@pytest.mark.parametrize(
+    ("loop", "by_epoch", "reason"),
+    [
+        ({"by_epoch": True, "max_epochs": 2}, False, "counts epochs .*by_epoch=True"),
+        ({"type": "EpochBasedTrainLoop", "max_epochs": 2}, False, "counts epochs .*by_epoch=True"),
+        ({"by_epoch": False, "max_iters": 2}, True, "counts iterations .*by_epoch=False"),
+        ({"type": "IterBasedTrainLoop", "max_iters": 2}, True, "counts iterations .*by_epoch=Fa"),
+    ],
+)
+def test_checkpoints_that_count_otherwise_than_the_loop_are_refused(loop, by_epoch, reason):
+    cfg = {"train_cfg": loop, "default_hooks": {"checkpoint": {"by_epoch": by_epoch}}}
+    with pytest.raises(ValueError, match=f"train_cfg {reason}"):
+        check_config(Config(cfg))
+    check_config(Config({**cfg, "default_hooks": {"checkpoint": {"by_epoch": not by_epoch}}}))
+    check_config(Config({**cfg, "default_hooks": {"checkpoint": None}}))
+    check_config(Config({**cfg, "train_cfg": None}))
+
+
+@pytest.mark.parametrize(("name", "value"), [("out_dir", "x"), ("filename_tmpl", "mine_{}.pth")])
+def test_checkpoints_that_resumption_would_not_find_are_refused(name, value):
+    cfg = Config({"default_hooks": {"checkpoint": {name: value}}})
+    with pytest.raises(ValueError, match=rf"default_hooks\.checkpoint\.{name} is set, but"):
+        check_config(cfg)
 
 
 def test_a_memory_of_elements_alone_is_not_trained_and_needs_order_in_tests_only():

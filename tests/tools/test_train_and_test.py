@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from mmengine.config import Config
 from mmengine.runner import FlexibleRunner
 from processes import free_port, run_tool, search_path, wait_for
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -20,6 +21,7 @@ from waiting import waiting_config
 from gsmap.checkpoints.reading import read_checked
 from gsmap.engine.run_log import MapRunner
 from tools import test as test_tool
+from tools.train import choose_start
 from tools.train import main as train
 
 pytestmark = pytest.mark.faults
@@ -78,6 +80,25 @@ def test_a_killed_training_goes_on_where_it_stopped(trained):
     assert epochs == list(range(first, 4))
     assert read_checked(trained / "epoch_3.pth").image_size == (160, 90)  # 0.4 of 400 x 225
     assert not list(trained.glob("*partial"))  # nothing half-written is left
+
+
+@pytest.mark.parametrize(
+    ("resume", "load_from", "option", "wanted"),
+    [
+        (True, None, None, "work/epoch_2.pth"),
+        (True, "other/epoch_1.pth", None, "other/epoch_1.pth"),
+        (True, "other/epoch_1.pth", "auto", "work/epoch_2.pth"),
+        (False, "other/epoch_1.pth", None, "other/epoch_1.pth"),
+    ],
+)
+def test_the_config_may_ask_for_resumption(resume, load_from, option, wanted, tmp_path):
+    for name in ("other/epoch_1.pth", "work/epoch_2.pth"):
+        (tmp_path / name).parent.mkdir()
+        torch.save({"state_dict": {"w": torch.ones(1)}}, tmp_path / name)
+    source = load_from and str(tmp_path / load_from)
+    cfg = Config({"work_dir": str(tmp_path / "work"), "resume": resume, "load_from": source})
+    choose_start(cfg, option)
+    assert (cfg.resume, cfg.load_from) == (resume, str(tmp_path / wanted))
 
 
 def test_training_shows_pictures_on_tensorboard(trained):

@@ -334,13 +334,15 @@ def check_config(cfg: Config) -> None:
             type. The optimizer, runner or backend does not exist. The pipeline lacks a transform
             that the head needs, or settings of this transform contradict the head. The sampler of a
             temporal model does not keep the order of frames, or the batch size of its training is
-            not the number of streams. A model with a memory is trained by iterations.
+            not the number of streams. A model with a memory is trained by iterations. Checkpoints
+            count epochs in a training by iterations, or the reverse, or are written elsewhere.
     """
     check_targets(cfg)  # transforms that compute the targets of the head
     _check_lengths(cfg)
     _check_backend(cfg)
     _check_streams(cfg)
     _check_memory_loop(cfg)
+    _check_checkpoints(cfg)
     _check_schedule(cfg)
     optimizer = (cfg.get("optim_wrapper") or {}).get("optimizer") or {}
     # Without this check, mmengine would build a run without an optimizer.
@@ -516,6 +518,11 @@ def _check_keys(cfg: Config) -> None:
                 )
         if key == "load_from" and not isinstance(value, str | None):
             raise InputError(f"{cfg.filename}: load_from must be a path, got {value!r:.60}.")
+        if key == "resume" and not isinstance(value, bool):
+            raise InputError(
+                f"{cfg.filename}: resume must be True or False, got {value!r:.60}; a checkpoint to "
+                "resume from is load_from."
+            )
         if is_known or key.startswith("_"):
             continue
         hint = suggestion(key, names=_known_keys())
@@ -545,20 +552,52 @@ def _check_memory_loop(cfg: Config) -> None:
     A loop of iterations sets the training mode before each iteration, and a change of the mode
     empties the memory.
     """
-    settings = cfg.get("train_cfg") or {}
-    kind = settings.get("type")
-    by_iterations = not settings.get("by_epoch", True)
-    if kind is not None:
-        from mmengine.runner import IterBasedTrainLoop  # slow to import
-
-        loop_class = class_of_type(kind=kind, registry=LOOPS) or object
-        by_iterations = issubclass(loop_class, IterBasedTrainLoop)
-    if by_iterations and has_trained_memory(cfg):
+    if _counts_epochs(cfg) is False and has_trained_memory(cfg):
         raise InputError(
             f"{cfg.filename}: train_cfg counts iterations, in which the memory of the model "
             "(model.temporal or model.prior) would be empty: set train_cfg to "
             "dict(type='EpochBasedTrainLoop', max_epochs=...)."
         )
+
+
+def _counts_epochs(cfg: Config) -> bool | None:
+    """Whether the training loop counts epochs; None if this is unknown."""
+    settings = cfg.get("train_cfg") or {}
+    kind = settings.get("type")
+    if kind is None:
+        return settings.get("by_epoch")
+    from mmengine.runner import EpochBasedTrainLoop, IterBasedTrainLoop  # slow to import
+
+    loop_class = class_of_type(kind=kind, registry=LOOPS) or object
+    if issubclass(loop_class, EpochBasedTrainLoop):
+        return True
+    return False if issubclass(loop_class, IterBasedTrainLoop) else None
+
+
+def _check_checkpoints(cfg: Config) -> None:
+    """Require checkpoints from which ``--resume`` can continue.
+
+    They count as the training loop does, and have the default names in the work folder.
+    """
+    hook = (cfg.get("default_hooks") or {}).get("checkpoint", {})
+    if not isinstance(hook, dict):  # None: no checkpoints
+        return
+    setting = "default_hooks.checkpoint"
+    counts_epochs = _counts_epochs(cfg)
+    if counts_epochs is not None and hook.get("by_epoch", True) != counts_epochs:
+        unit = "epochs" if counts_epochs else "iterations"
+        raise InputError(
+            f"{cfg.filename}: train_cfg counts {unit} and {setting} does not, so a training could "
+            f"not be resumed: set {setting}.by_epoch={counts_epochs}, and {setting}.interval to a "
+            f"number of {unit}."
+        )
+    remedies = {"out_dir": "give --work-dir", "filename_tmpl": "leave it out"}
+    for name, remedy in remedies.items():
+        if hook.get(name) is not None:
+            raise InputError(
+                f"{cfg.filename}: {setting}.{name} is set, but --resume finds only checkpoints "
+                f"with default names in the work folder: {remedy}."
+            )
 
 
 def _check_streams(cfg: Config) -> None:
