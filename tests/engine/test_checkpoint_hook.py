@@ -7,6 +7,7 @@ import sys
 import textwrap
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from mmengine.model import BaseModel
 from mmengine.runner import BaseLoop
 from mmengine.runner.checkpoint import save_checkpoint
 from processes import run_python
-from torch.utils.data import ConcatDataset
+from torch.utils.data import BatchSampler, ConcatDataset
 
 import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.reading import read_checked
@@ -211,21 +212,27 @@ def learn(
     lr=0.1,
     model=Learner,
     loader=None,
+    accumulative_counts=1,
     **options,
 ) -> int:
     """Train for some epochs, with a validation after every second and the last; return how many."""
     Learner.validations = 0
     before = torch.serialization.get_safe_globals()
     data = [{"inputs": torch.ones(1)}] * 2
+    if loader is None or "dataset" not in loader:
+        loader = torch.utils.data.DataLoader(train or data, **(loader or {}))
     runner = MapRunner(
         model(),
         str(work_dir),
-        train_dataloader=torch.utils.data.DataLoader(train or data, **(loader or {})),
+        train_dataloader=loader,
         val_dataloader=torch.utils.data.DataLoader(val or data[:1]),
         train_cfg={"by_epoch": True, "max_epochs": epochs, "val_interval": 2},
         val_cfg={},
         val_evaluator=Evaluator(Nothing()),
-        optim_wrapper={"optimizer": {"type": "SGD", "lr": lr}},
+        optim_wrapper={
+            "optimizer": {"type": "SGD", "lr": lr},
+            "accumulative_counts": accumulative_counts,
+        },
         param_scheduler=schedule,
         default_hooks={"checkpoint": {"type": "AtomicCheckpointHook", "interval": 1, **options}},
         load_from=resume_from and str(resume_from),
@@ -429,6 +436,42 @@ def test_a_resumed_run_has_the_augmentation_of_the_stopped_one(persistent, tmp_p
     found = torch.load(tmp_path / "resumed/epoch_3.pth", weights_only=False)
     wanted = torch.load(tmp_path / "whole/epoch_3.pth", weights_only=False)
     assert torch.equal(found["state_dict"]["weight"], wanted["state_dict"]["weight"])
+
+
+class Recorder(Learner):
+    """A learner that notes its inputs."""
+
+    seen: ClassVar[list[float]] = []
+
+    def forward(self, inputs, data_samples=None, mode="tensor"):
+        self.seen.extend(map(float, inputs))
+        return super().forward(inputs)
+
+
+@pytest.mark.parametrize("batches", [None, {"type": BatchSampler, "drop_last": True}])
+def test_a_resumed_run_without_a_seed_has_the_order_of_the_stopped_one(batches, tmp_path):
+    data = [{"inputs": torch.tensor(float(number))} for number in range(8)]
+    sampler = {"type": "DefaultSampler", "shuffle": True}
+    loader = {"dataset": data, "batch_size": 2, "sampler": sampler, "batch_sampler": batches}
+    options = {"loader": loader, "model": Recorder}
+    Recorder.seen.clear()
+    learn(tmp_path / "whole", 3, **options)
+    wanted = Recorder.seen[8:]
+    Recorder.seen.clear()
+    learn(tmp_path / "resumed", 3, tmp_path / "whole/epoch_1.pth", **options)
+    assert Recorder.seen == wanted
+
+
+def test_a_resumed_run_with_larger_batches_counts_its_own_iterations(tmp_path):
+    data = [{"inputs": torch.ones(1)}] * 8
+    learn(tmp_path, 3, train=data)
+    start, loader = tmp_path / "epoch_3.pth", {"batch_size": 4}
+    assert learn(tmp_path, 4, start, train=data, loader=loader, accumulative_counts=2) == 1
+    meta = torch.load(tmp_path / "epoch_4.pth", weights_only=False)["meta"]
+    assert (meta["epoch"], meta["iter"]) == (4, 8)
+    log = "".join(path.read_text() for path in tmp_path.glob("*/*.log"))
+    assert "after 24 iterations, and this run has 2 in each epoch" in log
+    assert "goes on after iteration 6" in log
 
 
 @pytest.mark.parametrize(

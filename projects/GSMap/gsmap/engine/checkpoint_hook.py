@@ -92,6 +92,23 @@ def _pass_model_facts(loop: Any, path: Path, meta: dict[str, Any]) -> None:
     loop.evaluator.dataset_meta = {**data_facts, **facts}
 
 
+def _resume_sampler_seed(runner: Runner, seed: int | None) -> None:
+    """Let the sampler of a resumed training go on with the seed of the checkpoint.
+
+    mmengine restores the seed of the run, which the sampler has got before. A sampler with another
+    seed from the config keeps it.
+
+    Args:
+        runner: The resumed run, with the seed that it began with.
+        seed: Seed of the checkpoint; None if unknown.
+    """
+    loader = runner.train_dataloader
+    # A batch sampler from the config contains the sampler, which the loader then lacks.
+    for sampler in {loader.sampler, getattr(loader.batch_sampler, "sampler", None)}:
+        if seed is not None and getattr(sampler, "seed", None) == runner.seed:
+            sampler.seed = seed
+
+
 def _described_datasets(runner: Runner) -> list[Any]:
     """Return the training data sets that know their image size and their signals."""
     datasets = innermost(runner.train_dataloader.dataset)
@@ -184,6 +201,7 @@ class AtomicCheckpointHook(CheckpointHook):
         self._state_before_val: dict[str, Any] | None = None  # None outside of a validation
         self._saved_states: list[dict[str, Any]] | None = None  # of all ranks, during a save
         self._has_saved = False
+        self._saved_iter: int | None = None  # iteration of the checkpoint that the run goes on from
 
     def before_run(self, runner: Runner) -> None:
         """Register the safe checkpoint loaders; mmengine loads a checkpoint after this call."""
@@ -224,6 +242,8 @@ class AtomicCheckpointHook(CheckpointHook):
         if "optimizer" in checkpoint and runner._resume:
             self._fit_optimizer(runner, checkpoint=checkpoint)
         if runner._resume:
+            _resume_sampler_seed(runner, seed=meta.get("seed"))
+            self._resume_iterations(runner, meta=meta)
             self._resumed_state = resumed_random_state(checkpoint=checkpoint, runner=runner)
         trained_meta = meta.get("dataset_meta")
         if isinstance(trained_meta, dict):
@@ -233,6 +253,24 @@ class AtomicCheckpointHook(CheckpointHook):
                     self._check_split(trained_meta, loop=loop)
         if isinstance(runner._test_loop, BaseLoop):
             _pass_model_facts(runner._test_loop, path=Path(str(source)), meta=meta)
+
+    def _resume_iterations(self, runner: Runner, meta: dict[str, Any]) -> None:
+        """Convert the number of iterations of a checkpoint to the length of this run's epochs.
+
+        Epochs have another length with another batch size, data set or number of processes.
+        """
+        self._saved_iter = meta["iter"]
+        loop = runner.train_loop
+        if not isinstance(loop, EpochBasedTrainLoop):
+            return
+        iterations = meta["epoch"] * len(loop.dataloader)
+        if iterations != meta["iter"]:
+            runner.logger.warning(
+                f"{runner._load_from} was saved after {meta['iter']} iterations, and this run has "
+                f"{len(loop.dataloader)} in each epoch (another batch size, data set or number of "
+                f"processes), so it goes on after iteration {iterations}."
+            )
+            meta["iter"] = iterations
 
     def _fit_optimizer(self, runner: Runner, checkpoint: dict) -> None:
         """Convert the optimizer state of a checkpoint to the parameter groups of a resumed run.
@@ -351,7 +389,8 @@ class AtomicCheckpointHook(CheckpointHook):
         is_at_interval = progress % loop.val_interval == 0 or progress == end
         is_due = has_begun and is_at_interval
         marker = Path(runner.work_dir, VALIDATED)
-        is_validated = marker.exists() and read_text(marker) == str(runner.iter)
+        saved_iter = runner.iter if self._saved_iter is None else self._saved_iter
+        is_validated = marker.exists() and read_text(marker) == str(saved_iter)
         if is_due and runner.val_loop is not None and not is_validated:
             runner.logger.info("The run was cut off before its validation, which is run now.")
             runner.val_loop.run()
