@@ -213,6 +213,7 @@ def learn(
     model=Learner,
     loader=None,
     accumulative_counts=1,
+    evaluator=None,
     **options,
 ) -> int:
     """Train for some epochs, with a validation after every second and the last; return how many."""
@@ -228,7 +229,7 @@ def learn(
         val_dataloader=torch.utils.data.DataLoader(val or data[:1]),
         train_cfg={"by_epoch": True, "max_epochs": epochs, "val_interval": 2},
         val_cfg={},
-        val_evaluator=Evaluator(Nothing()),
+        val_evaluator=evaluator or Evaluator(Nothing()),
         optim_wrapper={
             "optimizer": {"type": "SGD", "lr": lr},
             "accumulative_counts": accumulative_counts,
@@ -558,8 +559,24 @@ def test_a_test_tells_results_which_checkpoint_it_is_of_and_how_that_was_calibra
 def test_the_best_of_the_validations_is_kept(tmp_path):
     learn(tmp_path, 3, save_best="figure", rule="greater")
     assert [path.name for path in tmp_path.glob("best*")] == ["best_figure_epoch_2.pth"]
-    with pytest.raises(ValueError, match=r"save_best names 'chamfer/mAP', which .* not measure"):
+    with pytest.raises(ValueError, match=r"names 'chamfer/mAP', .* measure; it measures figure\."):
         learn(tmp_path / "other", 2, save_best="chamfer/mAP", rule="greater")
+
+
+@pytest.mark.parametrize("save_best", ["auto", "loss/figure"])
+def test_a_resumed_run_keeps_no_score_of_another_metric(save_best, tmp_path):
+    class Measuring(Nothing):
+        def compute_metrics(self, results):
+            return {"loss/figure": 1.0, "figure": 5.0}
+
+    evaluator = Evaluator(Measuring())
+    learn(tmp_path, 2, save_best="figure", rule="greater", evaluator=evaluator)
+    start = tmp_path / "epoch_2.pth"
+    learn(tmp_path, 4, start, save_best=save_best, rule="greater", evaluator=evaluator)
+    names = sorted(path.name for path in tmp_path.glob("best*"))
+    assert names == ["best_figure_epoch_2.pth", "best_loss_figure_epoch_4.pth"]
+    logs = "".join(path.read_text() for path in tmp_path.glob("*/*.log"))
+    assert logs.count("is of another metric than save_best (loss/figure)") == 1
 
 
 def test_a_checkpoint_names_no_file_that_its_training_removes(tmp_path):

@@ -448,6 +448,26 @@ class AtomicCheckpointHook(CheckpointHook):
             if self._is_foreign(path, folder=folder):
                 paths[name] = None
 
+    def _forget_other_best(self, runner: Runner, name: str) -> None:
+        """Forget the best score of a resumed run if it is of another metric than a given one.
+
+        mmengine stores the score of a single metric without its name, which is in the file's name.
+        """
+        info = runner.message_hub.runtime_info
+        if "best_score" not in info:
+            return
+        best = Path(str(info.get("best_ckpt"))).name
+        prefix = f"best_{name}_".replace("/", "_")
+        if re.fullmatch(rf"{re.escape(prefix)}(epoch|iter)_\d+\.pth", best):
+            return
+        runner.logger.warning(
+            f"{best!r:.80} is of another metric than save_best ({name}): it stays, and this run "
+            "looks for its best from now on."
+        )
+        del info["best_score"]
+        info.pop("best_ckpt", None)  # mmengine removes the best checkpoint for a better one
+        self.best_ckpt_path = None
+
     @staticmethod
     def _is_foreign(path: Any, folder: Path) -> bool:
         """Whether a path from a checkpoint is not a best checkpoint in the run's folder."""
@@ -465,13 +485,18 @@ class AtomicCheckpointHook(CheckpointHook):
         Raises:
             ValueError: If the validation lacks the metric that ``save_best`` names.
         """
-        for name in getattr(self, "key_indicators", ()):  # metrics in `save_best`, if it is set
-            if metrics and name not in metrics:
+        names = getattr(self, "key_indicators", [])  # metrics in `save_best`, if it is set
+        for name in names:
+            # mmengine replaces "auto" by the first metric.
+            if metrics and name not in metrics and name != "auto":
                 mean_names = [metric for metric in metrics if metric.endswith("/mAP")]
                 raise InputError(
                     f"default_hooks.checkpoint.save_best names {name!r}, which the validation does "
-                    f"not measure; it measures {', '.join(mean_names)}."
+                    f"not measure; it measures {', '.join(mean_names or metrics)}."
                 )
+        if metrics and len(names) == 1:
+            name = next(iter(metrics)) if names[0] == "auto" else names[0]
+            self._forget_other_best(runner, name=name)
         super().after_val_epoch(runner, metrics=metrics)
         if runner.rank == 0:
             write_text(Path(runner.work_dir, VALIDATED), text=str(runner.iter))

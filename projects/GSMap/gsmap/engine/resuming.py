@@ -105,10 +105,9 @@ def _find_unreadable(value: Any, name: str) -> tuple[str, Any]:
         value: Value that `_is_readable` refuses.
         name: Dotted name of the value.
     """
-    if isinstance(value, list | tuple):
-        value = dict(enumerate(value))
-    if isinstance(value, Mapping):
-        for key, entry in value.items():
+    entries = dict(enumerate(value)) if isinstance(value, list | tuple) else value
+    if isinstance(entries, Mapping):
+        for key, entry in entries.items():
             if not _is_readable(entry):
                 return _find_unreadable(entry, name=f"{name}.{key}")
     return name, value
