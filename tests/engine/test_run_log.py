@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from mmdet3d.datasets import CBGSDataset
 from mmengine.config import Config
 from mmengine.dataset import ClassBalancedDataset, ConcatDataset, RepeatDataset
 from mmengine.evaluator import Evaluator
@@ -131,12 +132,16 @@ def test_only_elements_of_samples_in_use_are_counted(minicity_annotations):
     part = dataset.get_subset([1])
     balanced = ClassBalancedDataset(dataset, oversample_thr=1e-3)
     balanced.repeat_indices = [0, 1, 1]
+    resampled = CBGSDataset(dataset, lazy_init=True)
+    resampled.sample_indices = [1, 1]
+    resampled._fully_initialized = True
     for used, expected in (
         (part, counts[1:]),
         (Subset(dataset, [1]), counts[1:]),
         (RepeatDataset(part, times=2), counts[1:] * 2),
         (Subset(RepeatDataset(dataset, times=2), [3]), counts[1:]),
         (balanced, [*counts, counts[1]]),
+        (resampled, [counts[1], counts[1]]),
         (ConcatDataset([part, dataset]), [counts[1], *counts]),
     ):
         assert _element_counts(used).tolist() == expected

@@ -265,9 +265,9 @@ def _element_counts(dataset: Any) -> np.ndarray:
         return np.concatenate([_element_counts(inner) for inner in dataset.datasets])
     if hasattr(dataset, "dataset"):
         counts = _element_counts(dataset.dataset)
-        # Samples of `RepeatDataset`, or else of `ClassBalancedDataset` or of torch's `Subset`.
+        # Samples of `RepeatDataset`, or else of `ClassBalancedDataset`, `CBGSDataset` or `Subset`.
         indices = np.arange(len(dataset)) % len(counts)
-        for name in ("repeat_indices", "indices"):
+        for name in ("repeat_indices", "sample_indices", "indices"):
             indices = getattr(dataset, name, indices)
         return counts[np.asarray(indices)]
     return np.maximum(dataset.instance_counts(), 0)
