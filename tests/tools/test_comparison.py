@@ -14,6 +14,8 @@ from comparison.jobs import Job
 from comparison.plan import Protocol, Run, parse_entry, plan
 from comparison.results import check_one_test_set, evaluator_for, read_result, rescore
 from comparison.tables import as_json, differences_to_first, markdown
+from mmdet3d.registry import DATA_SAMPLERS
+from torch.utils.data import BatchSampler
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.torchrun import OWN_WORDS
@@ -147,6 +149,16 @@ def test_a_budget_is_whole_epochs_and_a_folder_one_run(tiny_config, protocol):
         plan(config, replace(protocol, options=("optim_wrapper.optimizer.lr=0.001",)))
 
 
+class OneBatch(BatchSampler):
+    """Batch sampler of one batch of an epoch."""
+
+    def __init__(self, sampler, batch_size):
+        super().__init__(sampler, batch_size, drop_last=True)
+
+    def __len__(self):
+        return 1
+
+
 @pytest.mark.parametrize(
     ("cores", "loader", "steps"),
     [
@@ -156,6 +168,9 @@ def test_a_budget_is_whole_epochs_and_a_folder_one_run(tiny_config, protocol):
         (1, "sampler=dict(_delete_=True, type='StreamTrainSampler', slots=2)", 1),
         (2, "sampler=dict(_delete_=True, type='StreamTrainSampler', slots=1)", 1),
         (1, "num_batch_per_epoch=3", 3),
+        (1, "batch_sampler=dict(type='OneBatch')", 1),
+        (1, "sampler=None", 2),
+        (1, "num_workers=1, multiprocessing_context='fork'", 2),
     ],
 )
 def test_an_epoch_has_the_steps_of_its_data_loader(
@@ -163,6 +178,7 @@ def test_an_epoch_has_the_steps_of_its_data_loader(
 ):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setitem(DATA_SAMPLERS.module_dict, "OneBatch", OneBatch)
     leaf = tmp_path / "leaf.py"
     leaf.write_text(f"_base_ = '{tiny_config}'\ntrain_dataloader = dict({loader})\n")
     config = entries(leaf, "a=CONFIG,train_dataloader.dataset.indices=[0,1,0]")

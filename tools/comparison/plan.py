@@ -398,13 +398,16 @@ def _count_steps(cfg: Config, processes: int) -> int:
     single_dataset_of(cfg, part="train", purpose="a comparison")  # raises an error for wrappers
     settings = cfg.train_dataloader.to_dict()  # a copy
     settings |= {"num_workers": 0, "persistent_workers": False, "prefetch_factor": None}
+    settings["multiprocessing_context"] = None  # not allowed without workers
     batch_size = settings["batch_size"]
     # This process builds the loader of all processes together, which have more streams.
     settings["batch_size"] *= processes
     with building(cfg):  # adds the name of the config to errors
-        if "slots" in settings["sampler"]:
+        if "slots" in (settings["sampler"] or {}):
             settings["sampler"]["slots"] *= processes
         loader = Runner.build_dataloader(settings, seed=0)
+    if settings.get("batch_sampler") is not None:
+        return len(loader)
     samples_per_process = math.ceil(len(loader.sampler) / processes)
     rounded = math.floor if loader.drop_last else math.ceil
     return rounded(samples_per_process / batch_size)
