@@ -141,7 +141,8 @@ def test_a_section_that_is_none_is_refused(tmp_path):
 
 
 def test_a_checkpoint_to_resume_from_is_no_value_of_resume():
-    read_config(Config({"resume": True}))
+    for value in (True, None):
+        read_config(Config({"resume": value}))
     with pytest.raises(ValueError, match=r"resume must be True .*, got 'a\.pth'; .*load_from"):
         read_config(Config({"resume": "a.pth"}))
 

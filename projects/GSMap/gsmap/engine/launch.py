@@ -518,7 +518,7 @@ def _check_keys(cfg: Config) -> None:
                 )
         if key == "load_from" and not isinstance(value, str | None):
             raise InputError(f"{cfg.filename}: load_from must be a path, got {value!r:.60}.")
-        if key == "resume" and not isinstance(value, bool):
+        if key == "resume" and not isinstance(value, bool | None):
             raise InputError(
                 f"{cfg.filename}: resume must be True or False, got {value!r:.60}; a checkpoint to "
                 "resume from is load_from."
