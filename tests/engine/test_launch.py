@@ -261,8 +261,9 @@ def test_a_loop_that_would_empty_the_memory_in_each_iteration_is_refused(name, l
 )
 def test_checkpoints_that_count_otherwise_than_the_loop_are_refused(loop, by_epoch, reason):
     cfg = {"train_cfg": loop, "default_hooks": {"checkpoint": {"by_epoch": by_epoch}}}
-    with pytest.raises(ValueError, match=f"train_cfg {reason}"):
+    with pytest.raises(ValueError, match=f"train_cfg {reason}") as error:
         check_config(Config(cfg))
+    assert "--resume could not continue where a training stopped" in str(error.value)
     check_config(Config({**cfg, "default_hooks": {"checkpoint": {"by_epoch": not by_epoch}}}))
     check_config(Config({**cfg, "default_hooks": {"checkpoint": None}}))
     check_config(Config({**cfg, "train_cfg": None}))

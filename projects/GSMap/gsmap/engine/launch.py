@@ -587,9 +587,9 @@ def _check_checkpoints(cfg: Config) -> None:
     if counts_epochs is not None and hook.get("by_epoch", True) != counts_epochs:
         unit = "epochs" if counts_epochs else "iterations"
         raise InputError(
-            f"{cfg.filename}: train_cfg counts {unit} and {setting} does not, so a training could "
-            f"not be resumed: set {setting}.by_epoch={counts_epochs}, and {setting}.interval to a "
-            f"number of {unit}."
+            f"{cfg.filename}: train_cfg counts {unit} and {setting} does not, so --resume could "
+            f"not continue where a training stopped: set {setting}.by_epoch={counts_epochs}, and "
+            f"{setting}.interval to a number of {unit}."
         )
     remedies = {"out_dir": "give --work-dir", "filename_tmpl": "leave it out"}
     for name, remedy in remedies.items():
