@@ -465,6 +465,12 @@ def test_a_resumed_run_without_a_seed_has_the_order_of_the_stopped_one(batches, 
     assert Recorder.seen == wanted
 
 
+def test_a_run_with_a_list_as_sampler_is_resumed(tmp_path):
+    loader = {"sampler": [1, 0]}
+    learn(tmp_path, 1, loader=loader)
+    assert learn(tmp_path, 2, tmp_path / "epoch_1.pth", loader=loader)
+
+
 def test_a_resumed_run_with_larger_batches_counts_its_own_iterations(tmp_path):
     data = [{"inputs": torch.ones(1)}] * 8
     learn(tmp_path, 3, train=data)

@@ -104,7 +104,7 @@ def _resume_sampler_seed(runner: Runner, seed: int | None) -> None:
     """
     loader = runner.train_dataloader
     # A batch sampler from the config contains the sampler, which the loader then lacks.
-    for sampler in {loader.sampler, getattr(loader.batch_sampler, "sampler", None)}:
+    for sampler in (loader.sampler, getattr(loader.batch_sampler, "sampler", None)):
         if seed is not None and getattr(sampler, "seed", None) == runner.seed:
             sampler.seed = seed
 
