@@ -28,6 +28,7 @@ MAX_CAMERA_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_RING_CAM_TIMESTAMP_DIFF) 
 MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 51 ms
 
 POSE_TABLE = "city_SE3_egovehicle.feather"  # file of each log with the poses of the vehicle
+_SAME_PLACE_M = 0.1  # largest distance along an axis of two poses that count as one
 
 # Logs with an unusable map or unusable sensor data.
 BROKEN_LOGS = (
@@ -76,7 +77,8 @@ class Argoverse2Log:
         Raises:
             FileNotFoundError: If the pose table is missing.
             ValueError: If the table is damaged or empty, a translation is not finite, a quaternion
-                does not have the length 1, or a time has several poses.
+                does not have the length 1, or a time has several poses that differ by more than
+                0.1 m.
         """
         path = self.log_dir / POSE_TABLE
         if not path.is_file():
@@ -84,12 +86,12 @@ class Argoverse2Log:
         # `explain_errors` adds the path and the advice to errors about the content of the file.
         with explain_errors(path, "download the log again"):
             table = _read_feather(path)
-            # A row may be repeated, but a time has one pose.
-            table = table.drop_duplicates().sort_values("timestamp_ns")
-            repeated = table["timestamp_ns"].duplicated()
-            if repeated.any():
-                time = table["timestamp_ns"][repeated].iloc[0]
-                raise InputError(f"it has several poses for the time {time} ns")
+            places = table[["timestamp_ns", "tx_m", "ty_m", "tz_m"]].groupby("timestamp_ns")
+            spread_m = (places.max() - places.min()).max(axis=1)
+            if (spread_m > _SAME_PLACE_M).any():
+                raise InputError(f"it has several poses for the time {spread_m.idxmax()} ns")
+            # The first pose of each time is kept.
+            table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
             # The quaternion of a rotation has the length 1. The comparison is also False for NaN.
