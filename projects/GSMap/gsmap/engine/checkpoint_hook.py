@@ -104,7 +104,8 @@ def _resume_sampler_seed(runner: Runner, seed: int | None) -> None:
     """
     loader = runner.train_dataloader
     # A batch sampler from the config contains the sampler, which the loader then lacks.
-    for sampler in (loader.sampler, getattr(loader.batch_sampler, "sampler", None)):
+    samplers: list[Any] = [loader.sampler, getattr(loader.batch_sampler, "sampler", None)]
+    for sampler in samplers:
         if seed is not None and getattr(sampler, "seed", None) == runner.seed:
             sampler.seed = seed
 
@@ -156,7 +157,7 @@ def _warn_of_differences(runner: Runner) -> None:
 
 def _warn_of_earlier_run(runner: Runner) -> None:
     """Log a warning if the work folder of a new run has checkpoints."""
-    names = sorted(path.name for path in numbered_checkpoints(runner.work_dir))
+    names = sorted(path.name for path in numbered_checkpoints(work_dir=runner.work_dir))
     if names:
         runner.logger.warning(
             f"{runner.work_dir} has checkpoints of an earlier run ({summarize_names(names)}), "
@@ -319,9 +320,9 @@ class AtomicCheckpointHook(CheckpointHook):
         checkpoint["meta"].update(_image_facts(runner))
         if self._saved_states is not None:
             checkpoint[RANDOM_STATES] = self._saved_states
-        drop_functions(checkpoint)
+        drop_functions(checkpoint=checkpoint)
         if not self._has_saved:
-            check_readable(checkpoint)
+            check_readable(checkpoint=checkpoint)
             self._has_saved = True
 
     def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
@@ -373,7 +374,7 @@ class AtomicCheckpointHook(CheckpointHook):
         self._forget_foreign_best(runner)
         _warn_of_differences(runner)
         if not runner._resume:
-            _warn_of_earlier_run(runner)
+            _warn_of_earlier_run(runner=runner)
         if isinstance(runner.val_loop, BaseLoop):
             self._check_split(_metainfo(runner.train_dataloader), loop=runner.val_loop)
         loop = runner.train_loop

@@ -252,8 +252,8 @@ def newest_checkpoint(
     Returns:
         Path of the checkpoint, or None if there is no valid one.
     """
-    numbers = numbered_checkpoints(work_dir)
-    earlier = _left_by_earlier_run(numbers, noted=Path(work_dir, NEWEST))
+    numbers = numbered_checkpoints(work_dir=work_dir)
+    earlier = _left_by_earlier_run(numbers=numbers, noted=Path(work_dir, NEWEST))
     if earlier:
         names = ", ".join(path.name for path in earlier)
         text = f"{work_dir}: {names} left out, from an earlier run than the latest checkpoint."
@@ -583,7 +583,7 @@ def _check_checkpoints(cfg: Config) -> None:
     if not isinstance(hook, dict):  # None: no checkpoints
         return
     setting = "default_hooks.checkpoint"
-    counts_epochs = _counts_epochs(cfg)
+    counts_epochs = _counts_epochs(cfg=cfg)
     if counts_epochs is not None and hook.get("by_epoch", True) != counts_epochs:
         unit = "epochs" if counts_epochs else "iterations"
         raise InputError(

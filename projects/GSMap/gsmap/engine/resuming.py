@@ -75,9 +75,9 @@ def check_readable(checkpoint: Mapping[str, Any]) -> None:
     """
     for part in _OPEN_PARTS:
         value = checkpoint.get(part)
-        if _is_readable(value):
+        if _is_readable(value=value):
             continue
-        name, entry = _find_unreadable(value, name=part)
+        name, entry = _find_unreadable(value=value, name=part)
         raise InputError(
             f"{name} of the checkpoint is a {type(entry).__name__}, with which the checkpoint "
             "could not be loaded: let what sets it, such as a hook or a data set, store numbers, "
@@ -108,8 +108,8 @@ def _find_unreadable(value: Any, name: str) -> tuple[str, Any]:
     entries = dict(enumerate(value)) if isinstance(value, list | tuple) else value
     if isinstance(entries, Mapping):
         for key, entry in entries.items():
-            if not _is_readable(entry):
-                return _find_unreadable(entry, name=f"{name}.{key}")
+            if not _is_readable(value=entry):
+                return _find_unreadable(value=entry, name=f"{name}.{key}")
     return name, value
 
 

@@ -254,7 +254,7 @@ def _describe_data(runner: Runner) -> dict[str, str]:
         f"x from {x_min:g} to {x_max:g} m, y from {y_min:g} to {y_max:g} m; "
         f"{', '.join(meta['classes'])}"
     )
-    most_elements = _element_counts(runner.train_dataloader.dataset).max()
+    most_elements = _element_counts(dataset=runner.train_dataloader.dataset).max()
     lines["elements"] = f"up to {most_elements} in a sample"
     return lines
 
@@ -264,7 +264,7 @@ def _element_counts(dataset: Any) -> np.ndarray:
     if hasattr(dataset, "datasets"):
         return np.concatenate([_element_counts(inner) for inner in dataset.datasets])
     if hasattr(dataset, "dataset"):
-        counts = _element_counts(dataset.dataset)
+        counts = _element_counts(dataset=dataset.dataset)
         # Samples of `RepeatDataset`, or else of `ClassBalancedDataset`, `CBGSDataset` or `Subset`.
         indices = np.arange(len(dataset)) % len(counts)
         for name in ("repeat_indices", "sample_indices", "indices"):
@@ -279,7 +279,7 @@ def _missed_elements_warning(runner: Runner, model: Any) -> str | None:
     datasets = innermost(runner.train_dataloader.dataset)
     if not groups or not all(hasattr(dataset, "instance_counts") for dataset in datasets):
         return None
-    counts = _element_counts(runner.train_dataloader.dataset)
+    counts = _element_counts(dataset=runner.train_dataloader.dataset)
     queries = groups[0].num  # only the first group is used in prediction
     excess = np.maximum(counts - queries, 0)
     if not excess.any():

@@ -7,10 +7,13 @@ resumed training would augment its samples differently.
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch.utils.data import DataLoader, get_worker_info
+
+if TYPE_CHECKING:  # a data set alone needs no torch
+    import torch
+    from torch.utils.data import DataLoader
 
 _BEFORE_FIRST_EPOCH = -1
 _NUM_SEEDS = 2**32  # numpy's generator takes seeds below
@@ -22,10 +25,12 @@ class _EpochSeeds:
 
     Attributes:
         seed: Seed of the current epoch, a number in memory that is shared with the training. ()
+        worker_id: Index of the worker, from 0 on.
         seen: Seed of the latest epoch of which this worker has loaded a sample.
     """
 
-    seed: torch.Tensor
+    seed: "torch.Tensor"
+    worker_id: int
     seen: int = _BEFORE_FIRST_EPOCH
 
 
@@ -41,7 +46,7 @@ class _WorkerStart:
         previous: Function that the loader had before.
     """
 
-    seed: torch.Tensor
+    seed: "torch.Tensor"
     previous: Callable[[int], None] | None
 
     def __call__(self, worker_id: int) -> None:
@@ -49,10 +54,10 @@ class _WorkerStart:
         global _seeds
         if self.previous is not None:
             self.previous(worker_id)
-        _seeds = _EpochSeeds(self.seed)
+        _seeds = _EpochSeeds(self.seed, worker_id=worker_id)
 
 
-def seed_epoch(loader: DataLoader, seed: int, epoch: int, rank: int) -> None:
+def seed_epoch(loader: "DataLoader", seed: int, epoch: int, rank: int) -> None:
     """Let the workers of a loader begin with new random numbers at their next sample.
 
     Without this call, they keep those of ``worker_init_fn``.
@@ -63,6 +68,8 @@ def seed_epoch(loader: DataLoader, seed: int, epoch: int, rank: int) -> None:
         epoch: Number of the epoch, from 0 on.
         rank: Rank of this process.
     """
+    import torch
+
     start = loader.worker_init_fn
     if not isinstance(start, _WorkerStart):
         number = torch.tensor(_BEFORE_FIRST_EPOCH).share_memory_()
@@ -77,14 +84,15 @@ def follow_epoch() -> None:
 
     A data set calls it before it augments a sample. Outside of a worker it does nothing.
     """
-    worker = get_worker_info()
-    if worker is None or _seeds is None:
+    if _seeds is None:
         return
     seed = int(_seeds.seed)
     if seed == _seeds.seen:
         return
+    import torch
+
     _seeds.seen = seed
-    seed = (seed + worker.id) % _NUM_SEEDS
+    seed = (seed + _seeds.worker_id) % _NUM_SEEDS
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - the transforms of mmcv use this generator
     torch.manual_seed(seed)
