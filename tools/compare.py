@@ -104,9 +104,11 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     Raises:
         ValueError: If no table matches.
     """
-    papers = [method.paper() for method in METHODS]
+    papers = []
     tables = []
-    for paper in papers:
+    for method in METHODS:
+        paper = method.paper()
+        papers.append(paper)
         tables += paper["tables"]
     for table in read_json(shipped_path("configs/tables.json")):  # tables of several methods
         tables.append(_add_rows(table, papers=papers))
@@ -216,7 +218,9 @@ def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
     Returns:
         The tables, in Markdown.
     """
-    results = [read_result(run.name, run.folder, run.seed) for run in runs]
+    results = []
+    for run in runs:
+        results.append(read_result(run.name, folder=run.folder, seed=run.seed))
     for text in args.runs:
         name, _, folder = text.partition("=")
         # Without "=", `folder` is empty and means the working folder.
@@ -260,7 +264,8 @@ def main() -> str:
             init=args.init,
             options=(*options, *args.cfg_options),
         )
-        runs = plan([parse_entry(text) for text in args.configs], protocol)
+        entries = [parse_entry(text) for text in args.configs]
+        runs = plan(entries, protocol)
     # Without --only, `args.only` is None, and all runs are chosen.
     chosen = [run for run in runs if args.only in (None, run.label)]
     if args.only and not chosen:
@@ -271,7 +276,10 @@ def main() -> str:
     if not args.rescore:
         train(chosen)
     tables = "" if args.only else tabulate(runs, args)
-    failed = [run.label for run in chosen if not run.is_done]
+    failed = []
+    for run in chosen:
+        if not run.is_done:
+            failed.append(run.label)
     if failed:
         # The error ends the command with an exit code, so the tables are printed before it.
         sys.stdout.write(f"{tables}\n")

@@ -63,7 +63,6 @@ from gsmap.utils.words import format_count
 
 # Names of reports that `print_reports` skips, because the code that makes them also prints them.
 PRINTED = ("intervals", "by", "uncertainty", "changes")
-_PRIOR_ELEMENTS = 50  # elements of --prior without --prior-elements
 
 
 class TruthSettings(NamedTuple):
@@ -151,12 +150,12 @@ def build_evaluator(args: argparse.Namespace, settings: MetricSettings) -> MapEv
     evaluator = MapEvaluator.from_names(args.eval, settings, args.gt_points)
     uses_min_score = any(metric.takes_min_score for metric in evaluator.metrics)
     if args.min_score is not None and not uses_min_score:
-        takers = [name for name in metric_files() if metric_class(name).takes_min_score]
-        raise InputError(f"--min-score applies to {', '.join(takers)}: leave it out.")
+        names = _metrics_with("takes_min_score")
+        raise InputError(f"--min-score applies to {names}: leave it out.")
     uses_thresholds = any(metric.takes_thresholds for metric in evaluator.metrics)
     if settings.thresholds and not (uses_thresholds or args.consistency):
-        takers = [name for name in metric_files() if metric_class(name).takes_thresholds]
-        raise InputError(f"--thresholds and --hard apply to {', '.join(takers)}: leave them out.")
+        names = _metrics_with("takes_thresholds")
+        raise InputError(f"--thresholds and --hard apply to {names}: leave them out.")
     if args.pr_curves and not any(metric.has_curves for metric in evaluator.metrics):
         raise InputError(
             "--pr-curves draws metrics that rank predictions over all samples: name chamfer or "
@@ -166,6 +165,15 @@ def build_evaluator(args: argparse.Namespace, settings: MetricSettings) -> MapEv
     if needs_ap and not any(metric.ranks for metric in evaluator.metrics):
         raise InputError("--by, --bootstrap and --against apply to AP: name chamfer or raster.")
     return evaluator
+
+
+def _metrics_with(attribute: str) -> str:
+    """Names of the metrics whose class has an attribute that is true, as a list in a sentence."""
+    names = []
+    for name in metric_files():
+        if getattr(metric_class(name), attribute):
+            names.append(name)
+    return ", ".join(names)
 
 
 def evaluate_results(
@@ -192,11 +200,9 @@ def evaluate_input(args: argparse.Namespace, evaluator: MapEvaluator) -> Evaluat
     """Score the result file, or with ``--prior`` the best fixed map."""
     if not args.prior:
         return evaluate_results(args.results, args, evaluator)
-    from gsmap.evaluation.analysis.prior import evaluate_prior
+    from gsmap.evaluation.analysis.prior import MAX_ELEMENTS, evaluate_prior
 
-    max_elements = args.prior_elements
-    if max_elements is None:
-        max_elements = _PRIOR_ELEMENTS
+    max_elements = MAX_ELEMENTS if args.prior_elements is None else args.prior_elements
     return evaluate_prior(
         args.prior,
         args.ground_truth,

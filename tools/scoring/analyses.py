@@ -196,8 +196,12 @@ def interval_report(
     if others is not None:
         other_reports, other_notes = others
         # As in `reports`, only metrics with an AP are compared. Only their reports have detections.
-        ranked = [report for report in other_reports if report.detections]
-        notes.extend(f"{args.against}: {note}" for note in other_notes)
+        ranked = []
+        for report in other_reports:
+            if report.detections:
+                ranked.append(report)
+        for note in other_notes:
+            notes.append(f"{args.against}: {note}")
         differences = ap_differences(reports, ranked, resamples)
         title = f"{args.results} minus {args.against}, {origin}"
         print(format_intervals(differences, title, signed=True) + "\n")

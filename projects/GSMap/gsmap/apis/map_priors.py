@@ -64,7 +64,7 @@ def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
         FileNotFoundError: If a file does not exist.
         ValueError: If the model takes no prior, or a prior is invalid or does not fit it.
     """
-    priors = open_priors(model, paths, stack)
+    priors = open_priors(model, paths=paths, stack=stack)
     model.prior.use(maps_for(model, priors))
 
 
@@ -110,9 +110,10 @@ def open_priors(
     # Files that are created come last, because the places of the others decide on theirs.
     for path in [*known_paths, *new_paths]:
         if path in new_paths:
-            known_places = [prior.settings.place for prior in priors.values()]
-            other_places = set(places).difference(known_places)
-            place = _new_place(new_paths, other_places)
+            other_places = set(places)
+            for known_prior in priors.values():
+                other_places.discard(known_prior.settings.place)
+            place = _new_place(new_paths, places=other_places)
             with model.prior.new_prior(place) as empty_prior:
                 empty_prior.save(path)
         prior = open_prior(path, update=update)
@@ -137,8 +138,10 @@ def _new_place(paths: Sequence[Path], places: Collection[str]) -> str:
         return place or paths[0].stem
     files = " and ".join(map(str, paths))
     subject = f"{files} does" if len(paths) == 1 else f"{files} do"
-    place_names = sorted(place or "an unknown place" for place in places)
-    names = ", ".join(place_names)
+    place_names = []
+    for place in places:
+        place_names.append(place or "an unknown place")
+    names = ", ".join(sorted(place_names))
     raise InputError(
         f"{subject} not exist, and the samples without a prior are in {names or 'no other place'}: "
         "make the prior of each place from the samples of this place alone, by --token or a "

@@ -172,8 +172,8 @@ class AtomicCheckpointHook(CheckpointHook):
     A run that is killed during a save keeps its previous checkpoint, so ``--resume`` always finds a
     complete one. A validation that was due when the run stopped is run first on resumption. A
     resumed run goes on with the random numbers of the stopped one, and validations do not change
-    them. Workers of the data loader begin anew with each epoch; those of an iteration-based
-    training begin anew on resumption. Each checkpoint contains the settings of its model.
+    them. The random numbers of the loader's workers depend on the epoch; in a training by
+    iterations they begin anew on resumption. Each checkpoint contains the settings of its model.
     Checkpoints are loaded with torch's ``weights_only``. When a run begins, the hook allows torch
     to load the classes that mmengine stores in a checkpoint.
 
@@ -399,9 +399,9 @@ class AtomicCheckpointHook(CheckpointHook):
     def before_train_epoch(self, runner: Runner) -> None:
         """Seed the loader's workers, and go on with the random numbers of the stopped run.
 
-        Starting the workers of the data loader takes a random number. Persistent workers are
-        started once in a run, so the run goes on later. The workers of an iteration-based training
-        have started before, and it skips batches before it goes on.
+        Starting the workers takes a random number. Persistent workers start after this call, in
+        the first epoch alone, so the random numbers are set in `before_train_iter`. So they are in
+        a training by iterations, whose workers have started before this call.
         """
         if not isinstance(runner.train_loop, EpochBasedTrainLoop):
             return

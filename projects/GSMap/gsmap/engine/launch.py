@@ -298,13 +298,14 @@ def _left_by_earlier_run(numbers: dict[Path, int], noted: Path) -> list[Path]:
     if not noted.is_file():
         return []
     name = Path(noted.read_text(encoding="utf-8", errors="replace")).name
-    latest = noted.with_name(name) if name else noted
-    if latest not in numbers:
+    path_of_name = {path.name: path for path in numbers}
+    latest = path_of_name.get(name)
+    if latest is None:
         return []
-    written = latest.stat().st_mtime_ns
+    written_ns = latest.stat().st_mtime_ns
     earlier = []
     for path, number in numbers.items():
-        if number > numbers[latest] and path.stat().st_mtime_ns < written:
+        if number > numbers[latest] and path.stat().st_mtime_ns < written_ns:
             earlier.append(path)
     return sorted(earlier, key=numbers.__getitem__)
 
@@ -565,13 +566,16 @@ def _counts_epochs(cfg: Config) -> bool | None:
     settings = cfg.get("train_cfg") or {}
     kind = settings.get("type")
     if kind is None:
-        return settings.get("by_epoch")
+        by_epoch = settings.get("by_epoch")
+        return None if by_epoch is None else bool(by_epoch)
     from mmengine.runner import EpochBasedTrainLoop, IterBasedTrainLoop  # slow to import
 
     loop_class = class_of_type(kind=kind, registry=LOOPS) or object
     if issubclass(loop_class, EpochBasedTrainLoop):
         return True
-    return False if issubclass(loop_class, IterBasedTrainLoop) else None
+    if issubclass(loop_class, IterBasedTrainLoop):
+        return False
+    return None
 
 
 def _check_checkpoints(cfg: Config) -> None:

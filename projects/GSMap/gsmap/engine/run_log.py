@@ -234,7 +234,9 @@ def _describe_data(runner: Runner) -> dict[str, str]:
     datasets = []
     for name, loader in loaders.items():
         inner_datasets = innermost(loader.dataset)
-        files = [getattr(inner, "ann_file", type(inner).__name__) for inner in inner_datasets]
+        files = []
+        for inner in inner_datasets:
+            files.append(getattr(inner, "ann_file", type(inner).__name__))
         samples = format_count(len(loader.dataset), noun="sample")
         lines[name] = f"{samples} of {summarize_names(list(dict.fromkeys(files)))}"
         datasets += inner_datasets
@@ -245,11 +247,13 @@ def _describe_data(runner: Runner) -> dict[str, str]:
         cameras += dataset.sample(0).cameras
     # Without a selection in the config, `cameras` of a data set is None: all cameras are used.
     names = datasets[0].cameras or {camera.name for camera in datasets[0].sample(0).cameras}
-    sizes = sorted({f"{camera.width} x {camera.height}" for camera in cameras})
+    sizes = set()
+    for camera in cameras:
+        sizes.add(f"{camera.width} x {camera.height}")
     meta = datasets[0].metainfo  # the map is equal in all data sets
     x_min, x_max = meta["x_range"]
     y_min, y_max = meta["y_range"]
-    lines["cameras"] = f"{len(names)}, their files {' and '.join(sizes)}"
+    lines["cameras"] = f"{len(names)}, their files {' and '.join(sorted(sizes))}"
     lines["map"] = (
         f"x from {x_min:g} to {x_max:g} m, y from {y_min:g} to {y_max:g} m; "
         f"{', '.join(meta['classes'])}"

@@ -138,9 +138,13 @@ def write_drive_film(
     row_of_token = {token: row for row, token in enumerate(file.column("token"))}
     # All results have equal samples in equal order, so the first one gives the rows of the samples.
     first_frames = next(iter(frames_by_result.values()))
-    rows = [row_of_token[frame.token] for frame in first_frames[:max_frames]]
     all_times_ns = file.column("timestamp_ns")
-    times_ns = [all_times_ns[row] for row in rows]
+    rows = []
+    times_ns = []
+    for frame in first_frames[:max_frames]:
+        row = row_of_token[frame.token]
+        rows.append(row)
+        times_ns.append(all_times_ns[row])
     root = Path(annotations).parent if data_root is None else data_root
     pictures = _draw_frames(
         file,
@@ -152,16 +156,15 @@ def write_drive_film(
     )
     write_film(path, pictures, times_ns)
     text = f"{scene}, {format_count(len(rows), 'frame')}: {path}"
-    shown = [frames[: len(rows)] for frames in frames_by_result.values()]
-    return text + _omissions(shown)
+    return text + _omissions(frames_by_result.values(), num_frames=len(rows))
 
 
-def _omissions(frames_of_results: Iterable[Sequence[DriveFrame]]) -> str:
-    """Text with the numbers of predictions that cannot be drawn; empty if there are none."""
+def _omissions(frames_of_results: Iterable[Sequence[DriveFrame]], num_frames: int) -> str:
+    """Text with the numbers of predictions in the first frames that cannot be drawn, if any."""
     num_unknown = 0
     num_short = 0
     for frames in frames_of_results:
-        for frame in frames:
+        for frame in frames[:num_frames]:
             is_known = frame.predictions.labels >= 0
             num_unknown += int((~is_known).sum())
             num_short += int((is_known & ~_has_length(frame)).sum())

@@ -22,6 +22,7 @@ from gsmap.structures.polylines import resample_all
 from gsmap.utils.errors import InputError
 from gsmap.utils.split_lists import require_same_list
 
+MAX_ELEMENTS = 50  # default of the largest number of elements of a prior
 _MIN_PRECISION = 1e-3  # the fit ends if an element matches in fewer than 1 of 1000 samples
 _REFINEMENTS = 3  # iterations that move an element to the mean of its matches
 _NUM_POINTS = 20  # points of each element
@@ -180,7 +181,7 @@ class _ClassFit:
 
 
 def fit_prior(
-    truth: Sequence[MapElements], chamfer: ChamferConfig, max_elements: int = 50
+    truth: Sequence[MapElements], chamfer: ChamferConfig, max_elements: int = MAX_ELEMENTS
 ) -> MapElements:
     """Fit the constant set of elements with the best AP on a training set.
 
@@ -228,7 +229,7 @@ def evaluate_prior(
     train_path: str | Path,
     truth_path: str | Path,
     evaluator: MapEvaluator,
-    max_elements: int = 50,
+    max_elements: int = MAX_ELEMENTS,
     allow_other_split: bool = False,
 ) -> Evaluation:
     """Fit a prior on one file of ground truth and evaluate it on another.
