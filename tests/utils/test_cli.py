@@ -187,10 +187,9 @@ def test_impatience_does_not_cut_the_clean_up_off(tmp_path):
     """Ctrl-C, five times: the half-written file goes all the same, and there is one line."""
     program = f"""
 import os, signal, time
-from gsmap.utils import cli
-from gsmap.utils.errors import InputError, InputTypeError, NotFiniteError, WorkError
+from gsmap.utils import cli, signals
 from gsmap.utils.files import atomic_write
-cli.CLEAN_UP_S = 600.0
+signals.CLEAN_UP_S = 600.0
 signal.signal(signal.SIGINT, signal.default_int_handler)  # these tests may run in the background
 unlink = os.unlink
 def slowly(path):

@@ -1,5 +1,7 @@
 """The pool of worker processes: order, memory, and how it ends."""
 
+import contextlib
+import ctypes
 import operator
 import os
 import signal
@@ -7,6 +9,8 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -49,6 +53,49 @@ def fail_once_others_write(path: Path) -> None:
             time.sleep(0.02)
         raise ValueError("bad")
     write_and_wait(path)
+
+
+class Finalized:
+    """Stands for an object of a library that Python collects when a signal arrives."""
+
+    def __del__(self):
+        signal.raise_signal(signal.SIGTERM)
+
+
+def drop_in_a_finalizer() -> None:
+    Finalized()
+
+
+def drop_in_c() -> None:
+    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))()
+
+
+def drop_in_a_weak_reference() -> None:
+    value = {1}
+    reference = weakref.ref(value, lambda _: signal.raise_signal(signal.SIGTERM))
+    del value
+    assert reference() is None
+
+
+def drop_as_a_library() -> None:
+    with contextlib.suppress(BaseException):
+        signal.raise_signal(signal.SIGTERM)
+
+
+def drop_and_hang(drop: Callable[[], None]) -> None:
+    drop()
+    hang(0)
+
+
+@pytest.mark.parametrize(
+    "drop", [drop_in_a_finalizer, drop_in_c, drop_in_a_weak_reference, drop_as_a_library]
+)
+def test_a_kill_whose_exception_is_dropped_ends_the_task_in_silence(drop, capfd):
+    """The pool ends its workers by SIGTERM, which may come anywhere in a task."""
+    with pytest.raises(SystemExit) as end:
+        list(ordered_map(drop_and_hang, [drop], 2))
+    assert end.value.code == 143
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("workers", [1, 2])

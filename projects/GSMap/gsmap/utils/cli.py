@@ -1,6 +1,5 @@
 """Argument parser and entry point of all commands: input checks, error messages and signals."""
 
-import _thread
 import argparse
 import atexit
 import errno
@@ -11,12 +10,8 @@ import re
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
-from functools import partial
-from importlib.machinery import ExtensionFileLoader
 from pathlib import Path
-from types import FrameType
 from typing import Any, NoReturn
 
 from gsmap.utils.faults import suggestion, user_message
@@ -25,12 +20,11 @@ from gsmap.utils.inputs import declare_files, protect_inputs
 from gsmap.utils.interrupt import INTERRUPTED_TEXT, is_first_rank
 from gsmap.utils.overrides import declare_overrides, describe_override
 from gsmap.utils.parallel import kill_forks_with_parent
+from gsmap.utils.signals import SignalHandler, hide_dropped_signals, signal_behind
 from gsmap.utils.terminal import escape_output
 
 BAD_INPUT = 2  # exit code, as for bad arguments in argparse
 END_SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
-CLEAN_UP_S = 5.0  # time in which further signals are ignored
-RESEND_DELAY_S = 0.05  # delay before a lost signal is sent again
 
 
 class EachOnce(argparse.Action):
@@ -215,7 +209,7 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
     """Run a command, and raise ``SystemExit`` if it fails; see `run_command`."""
     escape_output()
     os.environ.setdefault("NO_COLOR", "1")  # colours are control characters
-    handler = _SignalHandler()
+    handler = SignalHandler()
     try:
         try:
             _install(handler, clean_up_on_kill=clean_up_on_kill)
@@ -225,7 +219,7 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
             sys.stdout.flush()
         except Exception as error:
             # A library may replace the exception of a signal by another exception.
-            cause = _signal_behind(error)
+            cause = signal_behind(error)
             # After a signal, an OSError comes from a clean-up that failed, and is reported below.
             if cause is not None and not isinstance(error, OSError):
                 handler.has_ended = True
@@ -250,14 +244,11 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
         declare_overrides({})
 
 
-def _install(handler: "_SignalHandler", clean_up_on_kill: bool) -> None:
+def _install(handler: SignalHandler, clean_up_on_kill: bool) -> None:
     """Install the handlers of signals and of errors in threads, and unblock the signals."""
     logging.raiseExceptions = False  # no traceback for a log file on a full disk
     threading.excepthook = _report_thread_error
-    # The hook is a `partial` of `_hide_signal`, whose function is its attribute `func`.
-    is_installed = getattr(sys.unraisablehook, "func", None) is _hide_signal
-    if not is_installed:  # the first command of the process
-        sys.unraisablehook = partial(_hide_signal, sys.unraisablehook)
+    hide_dropped_signals()
     kill_forks_with_parent()
     report_lost_batches()  # workers send the error of a batch that they cannot serialise
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # ignored in the background of a shell
@@ -284,111 +275,6 @@ def _report_thread_error(args: Any) -> None:
     """Report an error in a thread of a library, such as a full disk while it writes a log."""
     if not _report(args.exc_value):
         threading.__excepthook__(args)
-
-
-class _SignalError(BaseException):
-    """Exception for a signal, which calls ``on_drop`` when it is garbage collected."""
-
-    on_drop: Callable[[], None]
-
-    def __del__(self) -> None:
-        self.on_drop()
-
-
-class _InterruptError(_SignalError, KeyboardInterrupt):
-    """Exception for Ctrl-C."""
-
-
-class _KillError(_SignalError, SystemExit):
-    """Exception for ``kill`` or the end of the terminal, with the exit code of the command."""
-
-
-class _SignalHandler:
-    """Handler of Ctrl-C and ``kill`` that raises one exception, so that clean-ups run once.
-
-    Further signals during the clean-up are ignored. Some code drops the exception: Python does so
-    in a finalizer and at the end of a fork, and C code and libraries do so mostly during imports.
-    If the exception is garbage collected before `run_command` catches it, the signal is sent again.
-    Forked workers inherit the handler, and ignore Ctrl-C.
-    """
-
-    def __init__(self) -> None:
-        self._main_process = os.getpid()
-        self._raise_time_s = -math.inf  # time of the last exception, on the monotonic clock
-        self.received: int | None = None  # signal whose exception was raised
-        self.has_ended = False  # from then on, no signal is sent again
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        if os.getpid() != self._main_process:  # a forked worker
-            if number == signal.SIGINT:
-                return
-            sys.exit(128 + number)
-        now_s = time.monotonic()
-        if now_s - self._raise_time_s < CLEAN_UP_S:
-            return
-        if _imports_extension(frame):
-            self._send_again(number)
-            return
-        self._raise_time_s = now_s
-        self.received = number
-        # The exception is not stored in a variable. Its traceback refers to this frame, so a
-        # variable of the frame would keep it alive.
-        raise self._exception(number)
-
-    def _exception(self, number: int) -> _SignalError:
-        """Return the exception for a signal."""
-        error = _InterruptError() if number == signal.SIGINT else _KillError(128 + number)
-        error.on_drop = partial(self._handle_drop, number)
-        return error
-
-    def _handle_drop(self, number: int) -> None:
-        """Send a signal again whose exception was dropped."""
-        if not self.has_ended and os.getpid() == self._main_process:
-            self._raise_time_s = -math.inf
-            self._send_again(number)
-
-    def _send_again(self, number: int) -> None:
-        """Send a signal after a delay.
-
-        `threading` is not used, because its locks may be held when a signal arrives.
-        """
-        _thread.start_new_thread(_send_later, (number,))
-
-
-def _send_later(number: int) -> None:
-    """Wait, and send a signal to the main thread, which runs the handlers of signals."""
-    time.sleep(RESEND_DELAY_S)
-    signal.pthread_kill(threading.main_thread().ident or 0, number)
-
-
-def _imports_extension(frame: FrameType | None) -> bool:
-    """Whether an extension module is being imported; an exception there may end the process."""
-    while frame is not None:
-        # Python's loader of extension modules runs their code in these methods.
-        if frame.f_code.co_name in ("create_module", "exec_module"):
-            loader = frame.f_locals.get("self")
-            if isinstance(loader, ExtensionFileLoader):
-                return True
-        frame = frame.f_back
-    return False
-
-
-def _signal_behind(error: BaseException | None) -> _SignalError | None:
-    """Return the signal exception in the chain of an exception, or None."""
-    while error is not None and not isinstance(error, _SignalError):
-        error = error.__cause__ or error.__context__
-    return error
-
-
-def _hide_signal(default_hook: Callable[[Any], object], args: Any) -> None:
-    """Hook for ``sys.unraisablehook`` that hides signal exceptions, as the signals are sent again.
-
-    Args:
-        default_hook: Hook for all other exceptions that Python drops.
-        args: Argument of the hook, with the exception in ``exc_value``.
-    """
-    if not isinstance(args.exc_value, _SignalError):
-        default_hook(args)
 
 
 def output_file(text: str) -> Path:

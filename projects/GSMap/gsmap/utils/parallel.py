@@ -16,10 +16,12 @@ from multiprocessing import util
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from tempfile import TemporaryDirectory
+from types import FrameType
 from typing import Any, TypeVar
 
 from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.inputs import watch_files
+from gsmap.utils.signals import SignalError, SignalHandler, hide_dropped_signals
 from gsmap.utils.terminal import escape_output
 
 Task = TypeVar("Task")
@@ -97,11 +99,13 @@ class _Worker:
 
     Attributes:
         function: Function of `ordered_map`.
+        handler: Handler that interrupts a task.
         must_stop: Whether SIGTERM has been received.
         is_working: Whether a task is in progress.
     """
 
     function: Callable[[Any], Any]
+    handler: SignalHandler
     must_stop = False
     is_working = False
 
@@ -114,6 +118,8 @@ def _start_worker(setup: Path) -> None:
     """
     escape_output()  # prints no control characters
     watch_files()  # raises an error if a pipe or an output of the command is read
+    hide_dropped_signals()
+    _Worker.handler = SignalHandler()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
     signal.signal(signal.SIGTERM, _stop_worker)
     # The worker was started with both signals blocked (`delay_signals`). Its handlers are set now.
@@ -130,17 +136,18 @@ def _end_with_parent() -> None:
         os._exit(1)  # ends all threads at once; `sys.exit` would end this thread only
 
 
-def _stop_worker(number: int, _frame: object) -> None:
+def _stop_worker(number: int, frame: FrameType | None) -> None:
     """Interrupt the current task by an exception, so that it cleans up, and start no other task.
 
     This is the handler of SIGTERM.
 
     Args:
-        number: Number of the signal. The exit code is 128 plus this number, as in shells.
+        number: Number of the signal.
+        frame: Frame that the signal interrupts.
     """
     _Worker.must_stop = True
     if _Worker.is_working:  # between tasks, a result is being sent and must be complete
-        raise SystemExit(128 + number)
+        _Worker.handler(number, frame)
 
 
 def _work(task: Any) -> Any:
@@ -150,6 +157,10 @@ def _work(task: Any) -> Any:
         if _Worker.must_stop:
             raise SystemExit(128 + signal.SIGTERM)
         return _Worker.function(task)
+    except SignalError:
+        _Worker.handler.has_ended = True
+        # An exception without a reference to the handler, which is sent to the parent.
+        raise SystemExit(128 + signal.SIGTERM) from None
     finally:
         _Worker.is_working = False
 
