@@ -159,7 +159,7 @@ def _work(task: Any) -> Any:
         return _Worker.function(task)
     except SignalError:
         _Worker.handler.has_ended = True
-        # An exception without a reference to the handler, which is sent to the parent.
+        # This exception is sent to the parent, so it does not refer to the handler.
         raise SystemExit(128 + signal.SIGTERM) from None
     finally:
         _Worker.is_working = False

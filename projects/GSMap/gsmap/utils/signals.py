@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C and ``kill`` by exceptions, so that clean-ups run, and none is lost."""
+"""Exceptions for Ctrl-C and ``kill``, so that clean-ups run. A lost one is raised again."""
 
 import _thread
 import math
@@ -122,7 +122,7 @@ def signal_behind(error: BaseException | None) -> SignalError | None:
 
 
 def hide_dropped_signals() -> None:
-    """Let Python print nothing where it drops the exception of a signal, which is sent again."""
+    """Hide what Python prints when it drops the exception of a signal, which is sent again."""
     # The hook is a `partial` of `_hide_signal`, whose function is its attribute `func`.
     if getattr(sys.unraisablehook, "func", None) is not _hide_signal:
         sys.unraisablehook = partial(_hide_signal, sys.unraisablehook)
