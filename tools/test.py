@@ -137,7 +137,7 @@ def main() -> None:
     from gsmap.engine.run_log import MapRunner
 
     checkpoint = checkpoint_for(args.config, args.checkpoint)
-    cfg = load_config(args)
+    cfg = load_config(args, for_training=False)
     dataset_of(cfg, "test")  # raises an error if there is none
     # The model gets the settings with which the checkpoint was trained. Notes name the changes.
     notes = adopt_settings(cfg, checkpoint, args.cfg_options)

@@ -276,6 +276,25 @@ def test_checkpoints_that_resumption_would_not_find_are_refused(name, value):
         check_config(cfg)
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        "default_hooks.checkpoint.filename_tmpl=mine_{}.pth",
+        "default_hooks.checkpoint.by_epoch=False",
+        "param_scheduler.1.T_max=7",
+        "optim_wrapper.optimizer.type=Nothing",
+        "train_dataloader.sampler.type=DefaultSampler",
+        "train_dataloader.dataset.pipeline=[]",
+        "train_cfg.type=IterBasedTrainLoop",
+    ],
+)
+def test_a_config_that_cannot_be_trained_here_may_be_tested(option):
+    args = parse("gsmap_stream_r18_minicity", "--cfg-options", option)
+    load_config(args, for_training=False)
+    with pytest.raises(ValueError, match="gsmap_stream_r18_minicity"):
+        load_config(args)
+
+
 def test_a_memory_of_elements_alone_is_not_trained_and_needs_order_in_tests_only():
     train = {"train_dataloader": {"batch_size": 2, "sampler": {"type": "DefaultSampler"}}}
     elements = {**WITH_MEMORY, **train, "model": {"temporal": {"elements": {}}}}

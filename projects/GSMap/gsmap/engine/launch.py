@@ -170,7 +170,7 @@ def _fit_loaders(cfg: Config) -> None:
                 )
 
 
-def load_config(args: argparse.Namespace) -> Config:
+def load_config(args: argparse.Namespace, for_training: bool = True) -> Config:
     """Read the config of a command, apply the command-line options, and check the result.
 
     Top-level keys ``_name``, which configs copy into other sections, are removed. So logs and
@@ -182,6 +182,7 @@ def load_config(args: argparse.Namespace) -> Config:
 
     Args:
         args: Parsed arguments; ``config`` and the options of `add_common_arguments` are used.
+        for_training: Whether the command trains; `check_config` has the difference.
 
     Raises:
         FileNotFoundError: If there is no such file or model.
@@ -196,7 +197,7 @@ def load_config(args: argparse.Namespace) -> Config:
         cfg.work_dir = args.work_dir
     elif cfg.get("work_dir") is None:
         cfg.work_dir = str(Path("work_dirs") / Path(args.config).stem)
-    check_config(cfg)
+    check_config(cfg, for_training=for_training)
     for name in list(cfg):  # a list, because the config loses keys in the loop
         if name.startswith("_"):
             cfg.pop(name)
@@ -326,22 +327,32 @@ def _is_undamaged_zip(path: Path) -> bool:
         raise
 
 
-def check_config(cfg: Config) -> None:
+def check_config(cfg: Config, for_training: bool = True) -> None:
     """Check the values of a config for mistakes that mmengine accepts without an error.
 
+    Args:
+        cfg: Config, as returned by `read_config`.
+        for_training: Whether the settings that only a training uses are checked, too. A config that
+            cannot be trained here may still be tested.
+
     Raises:
-        ValueError: If one of these mistakes is found. The learning-rate schedule and the training
-            end at different epochs. The training has no epoch, or a setting of a loop has a wrong
-            type. The optimizer, runner or backend does not exist. The pipeline lacks a transform
-            that the head needs, or settings of this transform contradict the head. The sampler of a
-            temporal model does not keep the order of frames, or the batch size of its training is
-            not the number of streams. A model with a memory is trained by iterations. Checkpoints
-            count epochs in a training by iterations, or the reverse, or are written elsewhere.
+        ValueError: If one of these mistakes is found. The training has no epoch, or a setting of a
+            loop has a wrong type. The runner or backend does not exist. The sampler of a temporal
+            model does not keep the order of frames. For a training also: The learning-rate schedule
+            ends at another epoch. The optimizer does not exist. The pipeline lacks a transform that
+            the head needs, or settings of this transform contradict the head. The batch size of a
+            temporal model is not the number of streams. A model with a memory is trained by
+            iterations. Checkpoints count epochs in a training by iterations, or the reverse, or are
+            written elsewhere.
     """
-    check_targets(cfg)  # transforms that compute the targets of the head
     _check_lengths(cfg)
     _check_backend(cfg)
-    _check_streams(cfg)
+    _check_streams(cfg, for_training=for_training)
+    runner_type = cfg.get("runner_type", "Runner")
+    _check_registered(cfg, component="runner", registry=RUNNERS, type_name=runner_type)
+    if not for_training:
+        return
+    check_targets(cfg)  # transforms that compute the targets of the head
     _check_memory_loop(cfg)
     _check_checkpoints(cfg)
     _check_schedule(cfg)
@@ -350,8 +361,6 @@ def check_config(cfg: Config) -> None:
     _check_registered(
         cfg, component="optimizer", registry=OPTIMIZERS, type_name=optimizer.get("type")
     )
-    runner_type = cfg.get("runner_type", "Runner")
-    _check_registered(cfg, component="runner", registry=RUNNERS, type_name=runner_type)
 
 
 def _check_lengths(cfg: Config) -> None:
@@ -604,16 +613,20 @@ def _check_checkpoints(cfg: Config) -> None:
             )
 
 
-def _check_streams(cfg: Config) -> None:
+def _check_streams(cfg: Config, for_training: bool) -> None:
     """Require samplers that keep the frames of each scene in order if the model is temporal.
 
     A temporal model remembers features, queries or map elements of the previous frame.
+
+    Args:
+        cfg: Config to check.
+        for_training: Whether the sampler of the training is checked, too.
     """
     temporal = (cfg.get("model") or {}).get("temporal")
     if temporal is None:
         return
     samplers = {"val": "StreamTestSampler", "test": "StreamTestSampler"}
-    if _has_trained_stream_memory(temporal):
+    if for_training and _has_trained_stream_memory(temporal):
         samplers["train"] = "StreamTrainSampler"
     for split, needed_sampler in samplers.items():
         loader = cfg.get(f"{split}_dataloader") or {}
