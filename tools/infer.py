@@ -464,10 +464,15 @@ def read_priors(
     )
 
 
-def save_priors(args: argparse.Namespace, priors: Sequence["AnyPrior"]) -> None:
-    """Write the priors of ``--update-prior`` to their files."""
+def finish_priors(args: argparse.Namespace, priors: Sequence["AnyPrior"]) -> None:
+    """Print which priors had nothing near samples; with ``--update-prior``, write their files."""
     if not args.update_prior:
+        from gsmap.apis.map_priors import empty_reads
+
+        for line in empty_reads(priors):
+            print(line)
         return
+    # A prior that is updated has nothing where the vehicle is for the first time.
     for prior, path in zip(priors, args.prior, strict=True):
         prior.save(path)
     print(f"updated: {', '.join(map(str, args.prior))}")
@@ -555,7 +560,7 @@ def main(argv: list[str] | None = None) -> str | None:
                 options=settings,
                 samples=count,
             )
-        save_priors(args, priors)
+        finish_priors(args, priors)
     print_summary(args, source, dataset.ann_file, len(chosen), broken)
     return None
 

@@ -129,7 +129,7 @@ def main() -> None:
         raise InputError("Nothing to do: name a metric after --eval, or a file after --out.")
     from mmengine.model import is_model_wrapper
 
-    from gsmap.apis.map_priors import use_priors
+    from gsmap.apis.map_priors import empty_reads, use_priors
     from gsmap.checkpoints.building import building
     from gsmap.checkpoints.reading import adopt_settings
     from gsmap.checkpoints.settings import dataset_of
@@ -148,11 +148,14 @@ def main() -> None:
     # `building` adds the names of the config's parts to errors. The stack closes the priors.
     with building(cfg), ExitStack() as stack:
         runner = MapRunner.from_cfg(cfg)
+        priors = []
         if args.prior:
             # In a distributed test, the model is within a wrapper.
             model = runner.model.module if is_model_wrapper(runner.model) else runner.model
-            use_priors(model, args.prior, stack)
+            priors = use_priors(model, args.prior, stack)
         metrics = runner.test()
+        for line in empty_reads(priors):
+            runner.logger.warning(line)
     if args.metrics_out and runner.rank == 0:
         write_text(args.metrics_out, json.dumps(metrics, indent=2, default=plain_value))
 

@@ -126,6 +126,20 @@ def test_a_prior_of_other_classes_or_cells_is_refused(settings, message):
         GivenMaps([MapPrior(settings)], CLASSES, grid=WINDOW)
 
 
+@pytest.mark.parametrize("kind", [MapPrior, GaussianPrior, ElementPrior])
+def test_frames_with_nothing_of_a_prior_in_range_are_counted(kind):
+    elements = MapElements.from_polylines([np.array([[3.0, -20.0], [3.0, 20.0]])], [2])
+    prior = kind(TOWN, elements) if kind is ElementPrior else kind(TOWN)
+    if kind is MapPrior:
+        prior.write(pose_at(0), WINDOW, values=raster())
+    if kind is GaussianPrior:
+        for _ in range(3):
+            prior.write(pose_at(0), WINDOW, elements=elements)
+    for x in (0.0, 0.0, 500.0):
+        GivenMaps([prior], CLASSES, grid=WINDOW).read(place(x=x))  # as each frame of a `LiveMap`
+    assert (prior.reads.samples, prior.reads.empty) == (3, 1)
+
+
 def test_a_frame_elsewhere_is_refused():
     maps = GivenMaps([MapPrior(TOWN)], CLASSES, grid=WINDOW)
     with pytest.raises(ValueError, match=r"sample 'token' is in 'city', and .* of \['town'\]"):

@@ -12,7 +12,7 @@ from mmdet3d.registry import MODELS
 from prior_cases import CLASSES
 from processes import run_tool
 
-from gsmap.apis.map_priors import open_priors
+from gsmap.apis.map_priors import empty_reads, open_priors
 from gsmap.engine.launch import read_config
 from gsmap.prior import LastSeen, MapPrior, PriorSettings, open_prior
 from gsmap.utils.inputs import protect_inputs
@@ -112,6 +112,37 @@ def test_priors_that_do_not_fit_are_refused(model, tiny_config, minicity_annotat
         run(whole, of=[str(tiny_config), str(weights)])
     with pytest.raises(SystemExit):
         infer.parse_args([drive, "--model", *model, "--out", out, "--update-prior"])
+
+
+def test_a_prior_with_nothing_near_the_samples_is_named(
+    model, minicity_annotations, tmp_path, capsys
+):
+    path, drive = tmp_path / "empty.prior", str(minicity_annotations["val"])
+    settings = PriorSettings(CLASSES, "boston-seaport", cell_m=0.6)
+    MapPrior(settings, LastSeen()).save(path)
+    infer.main([drive, "--model", *model, "--out", str(tmp_path / "a.json"), "--prior", str(path)])
+    count = len(lines_of(tmp_path / "a.json"))
+    text = (
+        f"the prior of 'boston-seaport' has nothing in the range of {count} of {count} samples, "
+        "so it changed nothing: compare its global frame with that of the poses."
+    )
+    assert text in capsys.readouterr().out
+    done = run_tool(
+        "tools/test.py", *model, "--work-dir", tmp_path / "work", "--prior", path,
+        "--out", tmp_path / "b.json", "--eval",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert text in done.stdout + done.stderr
+
+
+def test_some_empty_windows_are_no_wrong_frame():
+    prior = MapPrior(PriorSettings(CLASSES, "town"))
+    assert empty_reads([prior]) == []
+    prior.reads.add(is_empty=False)
+    assert empty_reads([prior]) == []
+    prior.reads.add(is_empty=True)
+    text = "the prior of 'town' has nothing in the range of 1 of 2 samples."
+    assert empty_reads([prior]) == [text]
 
 
 def test_a_new_prior_is_of_the_place_without_one(tmp_path):

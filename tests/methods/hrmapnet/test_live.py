@@ -42,11 +42,15 @@ def empty_prior(cell_m=1.5) -> MapPrior:
     return MapPrior(PriorSettings(CLASSES, "town", cell_m=cell_m), LastSeen())
 
 
-def test_a_live_map_reads_and_updates_a_prior(inferencer, rig):
+def test_a_live_map_reads_and_updates_a_prior(inferencer, rig, caplog):
     images, *calibration = rig
     prior = empty_prior()
+    new = inferencer.live(*calibration, frame="lidar", prior=empty_prior(), update_prior=True)
+    new(images, at=HERE)
+    assert "nothing in the range" not in caplog.text  # it is being made
     reading = inferencer.live(*calibration, frame="lidar", prior=prior)
     first = reading(images, at=HERE)
+    assert "the prior of 'town' has nothing in the range of a frame" in caplog.text
     assert prior.num_tiles == 0
     writing = inferencer.live(*calibration, frame="lidar", prior=prior, update_prior=True)
     np.testing.assert_array_equal(writing(images, at=HERE).points, first.points)

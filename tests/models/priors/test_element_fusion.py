@@ -162,6 +162,7 @@ def test_a_model_reads_elements_and_learns_as_before():
     for one, other in zip(alone, expected, strict=True):
         torch.testing.assert_close(one.pts, other.pts, rtol=0, atol=0)
     torch.testing.assert_close(given[0].pts, expected[0].pts, rtol=0, atol=0)  # 100 m before
+    assert (prior.reads.samples, prior.reads.empty) == (2, 1)
     is_element = given[1].labels_3d == 2
     is_element &= (given[1].pts[..., 0] - 3.0).abs().amax(1) < 1e-4
     assert is_element.sum() == 1

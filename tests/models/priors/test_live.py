@@ -14,7 +14,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.streams import Frame
 
 
-def test_a_live_map_fuses_elements_and_refuses_to_write_at_its_start(tmp_path):
+def test_a_live_map_fuses_elements_and_refuses_to_write_at_its_start(tmp_path, caplog):
     cfg = make_config()
     cfg.model.prior = ConfigDict(type="ElementFusion")
     torch.manual_seed(0)
@@ -30,8 +30,11 @@ def test_a_live_map_fuses_elements_and_refuses_to_write_at_its_start(tmp_path):
     found = live(images, at=Frame("a", "scene", 0, pose_at(100.0)))
     at_line = [np.abs(line[:, 0] - 3.0).max() < 1e-3 for line in found.polylines]
     assert sum(at_line) == 1
+    assert "nothing in the range" not in caplog.text
+    live(images, at=Frame("a", "scene", 0, pose_at(1000.0)))
     elsewhere = live(images, at=Frame("a", "scene", 0, pose_at(1000.0)))
     assert not any(np.abs(line[:, 0] - 3.0).max() < 1e-3 for line in elsewhere.polylines)
+    assert caplog.text.count("the prior of 'town' has nothing in the range of a frame") == 1
     with pytest.raises(ValueError, match="has elements, which a model can only read"):
         inferencer.live(intrinsics, cam_from_frame, frame="lidar", prior=prior, update_prior=True)
     with pytest.raises(ValueError, match="there is no prior to update: give one"):

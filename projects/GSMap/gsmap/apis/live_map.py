@@ -28,6 +28,10 @@ _NO_SIGNALS_TEXT = (
     "can_bus. From poses, motion_signals of gsmap.structures.vehicle_signals makes it "
     "(pose_only_signals for configs that have it)."
 )
+_NOTHING_NEAR_TEXT = (
+    "the prior of {place!r} has nothing in the range of a frame. If the vehicle is in this place, "
+    "compare the global frame of the prior with that of the poses."
+)
 
 if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
@@ -240,6 +244,7 @@ class LiveMap:
         else:
             frame = None
         self._dataset.frame_in_memory = frame
+        num_empty = sum(prior.reads.empty for prior in self._priors)
         predictions = self._inferencer.predict(
             self._dataset,
             allow_missing_cameras=self._allow_missing_cameras,
@@ -248,6 +253,11 @@ class LiveMap:
             update_priors=self._update_prior,
         )
         (data_sample,) = predictions  # the data set has one sample
+        for prior in self._priors:  # one at most
+            is_empty = prior.reads.empty > num_empty
+            # A prior that is updated has nothing where the vehicle is for the first time.
+            if is_empty and not self._update_prior:
+                self._warn_once(_NOTHING_NEAR_TEXT.format(place=prior.settings.place))
         return data_sample
 
     def _expects_signals(self) -> bool:

@@ -8,8 +8,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+from mmengine.dist import all_reduce
+
 from gsmap.prior.map_prior import MapPrior
 from gsmap.utils.errors import InputError
+from gsmap.utils.words import format_count
 
 if TYPE_CHECKING:  # the module is slow to import, so `open_priors` imports it when it is called
     from gsmap.prior.opening import AnyPrior
@@ -52,7 +56,7 @@ def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> 
     return model.prior.maps_of(priors, update=update)
 
 
-def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
+def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> "list[AnyPrior]":
     """Let a model read files of priors in all later tests, without changing the files.
 
     Args:
@@ -60,12 +64,42 @@ def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
         paths: The files, one for each place.
         stack: Context that closes the priors at its end. The model must not read them later.
 
+    Returns:
+        The priors in the order of ``paths``.
+
     Raises:
         FileNotFoundError: If a file does not exist.
         ValueError: If the model takes no prior, or a prior is invalid or does not fit it.
     """
     priors = open_priors(model, paths=paths, stack=stack)
     model.prior.use(maps_for(model, priors))
+    return priors
+
+
+def empty_reads(priors: "Sequence[AnyPrior]") -> list[str]:
+    """Describe how often each prior had nothing near a sample, in a test by several processes too.
+
+    Args:
+        priors: The priors, which samples have been read at. All processes must call this function.
+
+    Returns:
+        A line for each prior that had nothing in the range of at least one sample.
+    """
+    lines = []
+    for prior in priors:
+        counts = torch.tensor([prior.reads.samples, prior.reads.empty])
+        all_reduce(counts)  # sums the counts of all processes, in place
+        samples, empty = counts.tolist()
+        if not empty:
+            continue
+        line = (
+            f"the prior of {prior.settings.place!r} has nothing in the range of {empty} of "
+            f"{format_count(samples, 'sample')}"
+        )
+        if empty == samples:
+            line += ", so it changed nothing: compare its global frame with that of the poses"
+        lines.append(f"{line}.")
+    return lines
 
 
 def open_priors(

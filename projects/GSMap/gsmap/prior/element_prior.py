@@ -22,6 +22,7 @@ from gsmap.prior.file_format import (
     unpack_tile,
 )
 from gsmap.prior.inputs import Pose, planar_pose
+from gsmap.prior.reads import PriorReads
 from gsmap.prior.settings import PriorSettings
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.cutting import cut_to_range
@@ -68,6 +69,7 @@ class ElementPrior:
 
     Attributes:
         content: Word for the stored data in messages.
+        reads: Samples at which a model has read this prior.
 
     Raises:
         ValueError: If a label, a score or a vertex is out of range, an element has no length or
@@ -104,6 +106,7 @@ class ElementPrior:
         self.settings = settings
         self.rule = ElementRule() if rule is None else rule
         self.elements = flat
+        self.reads = PriorReads()
         self._bounds = bounds
 
     @classmethod

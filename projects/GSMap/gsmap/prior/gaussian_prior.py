@@ -28,6 +28,7 @@ from gsmap.prior.gaussian_updates import (
     sample_lines,
 )
 from gsmap.prior.inputs import PlanarPose, Pose, Raster, planar_pose, to_numpy
+from gsmap.prior.reads import PriorReads
 from gsmap.prior.settings import PriorSettings
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.grid import BEVGrid
@@ -86,6 +87,7 @@ class GaussianPrior:
 
     Attributes:
         content: Name of the stored objects, for messages.
+        reads: Samples at which a model has read this prior.
     """
 
     content: ClassVar[str] = "Gaussians"
@@ -93,6 +95,7 @@ class GaussianPrior:
     def __init__(self, settings: PriorSettings, rule: GaussianRule | None = None) -> None:
         self.settings = settings
         self.rule = GaussianRule() if rule is None else rule
+        self.reads = PriorReads()
         self._tiles: dict[TileKey, Stored] = {}
         self._lock = threading.RLock()
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsmap.prior.file_format import read_header, write_tiles
 from gsmap.prior.inputs import Pose, Raster, planar_pose, reserve_file, to_numpy
+from gsmap.prior.reads import PriorReads
 from gsmap.prior.rules import HitMissCounts, States, WriteRule
 from gsmap.prior.settings import PriorSettings
 from gsmap.prior.tiles import TileStore
@@ -52,6 +53,9 @@ class MapPrior:
             `KeepMaximum` are the rules of HRMapNet (arXiv 2409.00620).
         memory_bytes: Largest total size of the tiles in memory. A tile of three classes takes
             120 kB, or 240 kB with `HitMissCounts`.
+
+    Attributes:
+        reads: Samples at which a model has read this prior.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class MapPrior:
     ) -> None:
         self.settings = settings
         self.rule: WriteRule = HitMissCounts() if rule is None else rule
+        self.reads = PriorReads()
         side = settings.tile_cells
         num_classes = len(settings.classes)
         tile_shape = (self.rule.num_states, num_classes, side, side)

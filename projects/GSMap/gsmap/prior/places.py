@@ -249,4 +249,7 @@ class GivenMaps(PlaceMaps):
         Raises:
             ValueError: If the place of the frame is unknown, or has no map.
         """
-        return super().read(self.require_place(place))
+        known_place = self.require_place(place)
+        window = super().read(known_place)
+        self.find(known_place).reads.add(is_empty=not window.any())
+        return window

@@ -126,6 +126,7 @@ class ElementFusion(PriorModule):
             assert isinstance(prior, ElementPrior)  # `maps_of` has checked it
             # The elements are cut at the window and are in the annotation frame of the sample.
             elements = prior.read_elements(place.pose, self.window)
+            prior.reads.add(is_empty=len(elements) == 0)
             updated.append(self._fuse_sample(detections, elements, sigma_m=prior.rule.sigma_m))
         return updated
 

@@ -1,0 +1,28 @@
+"""Counts of the samples that a prior has been read at."""
+
+from dataclasses import dataclass
+
+
+@dataclass
+class PriorReads:
+    """Counts of the samples that a prior has been read at.
+
+    A prior with other axes or another origin than the poses of the samples is not an error: it has
+    nothing near them. These counts show it.
+
+    Attributes:
+        samples: Number of samples.
+        empty: Number of those with nothing of the prior in their range.
+    """
+
+    samples: int = 0
+    empty: int = 0
+
+    def add(self, is_empty: bool) -> None:
+        """Count one more sample.
+
+        Args:
+            is_empty: Whether the prior has nothing in the range of the sample.
+        """
+        self.samples += 1
+        self.empty += is_empty
