@@ -640,7 +640,6 @@ def group_scenes(
                 f"--join needs the place of each drive, and {scene!r} has no map_name: leave "
                 "--join out, or choose other drives with --scene."
             )
-        # `read_drive` refuses a scene that the file lacks.
         groups.setdefault(place or scene, []).append(scene)
     return groups
 
@@ -678,6 +677,41 @@ def read_results(args: argparse.Namespace, ann: AnnotationFile) -> dict[str, Map
     if has_truth(ann) and not args.allow_other_split:  # maps are scored
         require_results_of(ann.meta.split_list, file.about, args.results)
     return results
+
+
+def scenes_with_results(
+    args: argparse.Namespace,
+    ann: AnnotationFile,
+    results: Mapping[str, MapElements],
+    scenes: Sequence[str],
+) -> list[str]:
+    """Return the scenes that have results, and print how many others there are.
+
+    Args:
+        args: The options of the command.
+        ann: The samples.
+        results: Predictions by token.
+        scenes: Names of the scenes.
+
+    Raises:
+        ValueError: If the file lacks a scene, if a scene of ``--scene`` has no results, or if none
+            of the scenes has any.
+    """
+    require_scenes(ann, scenes)
+    found = set()
+    for token, scene in zip(ann.column("token"), ann.column("scene"), strict=True):
+        if token in results:
+            found.add(scene)
+    missing = [scene for scene in scenes if scene not in found]
+    if missing and (args.scene or len(missing) == len(scenes)):
+        raise InputError(
+            f"no sample of scene {missing[0]!r} has results: give the results of {args.ann}, or "
+            "choose other drives with --scene."
+        )
+    if missing:
+        number = format_count(len(missing), "drive")
+        print(f"not used: {number} without results, such as {missing[0]!r}")
+    return [scene for scene in scenes if scene in found]
 
 
 def merge_drives(
@@ -738,6 +772,10 @@ def main(argv: list[str] | None = None) -> str:
     ann = AnnotationFile(args.ann)
     scenes = args.scene or sorted(set(ann.column("scene")))
     check_options(args, ann)
+    results: dict[str, MapElements] = {}
+    if args.results:
+        results = read_results(args, ann)
+        scenes = scenes_with_results(args, ann, results, scenes)
     place = place_of(ann, scenes) if args.changes or args.prior else ""
     # Without a map_name of the samples, the prior is named after its file.
     prior_place = place or (args.prior.stem if args.prior else "")
@@ -745,10 +783,8 @@ def main(argv: list[str] | None = None) -> str:
     # Maps for the prior: the map of --map, and the map of each drive.
     maps = [open_map(args.map, args, ann, place)] if args.map else []
     passes: list[Pass] = []
-    results: dict[str, MapElements] = {}
     summary = f"a prior of {prior_place}"  # without results, the prior is the only output
     if args.results:
-        results = read_results(args, ann)
         groups = group_scenes(args, ann, scenes)
         passes, processor_s = merge_drives(args, ann, results, groups)
         frames = sum(len(one_pass.drive.frames) for one_pass in passes)

@@ -89,6 +89,26 @@ def test_samples_without_results_are_left_out_and_counted(files, tmp_path, capsy
     assert said in capsys.readouterr().out
 
 
+def test_drives_without_results_are_left_out_and_counted_or_refused(files, tmp_path, capsys):
+    results, ann = files
+    file = AnnotationFile(ann)
+    first, *others = file
+    far = replace(first, scene="away", map_name="other")
+    content = json.loads(results.read_text())
+    content["results"] = [r for r in content["results"] if r["sample_token"] != first.token]
+    (tmp_path / "fewer.json").write_text(json.dumps(content))
+    write_annotations(tmp_path / "two.arrow", file.meta, [far, *others])
+    command = [str(tmp_path / "fewer.json"), "--ann", str(tmp_path / "two.arrow")]
+    prior = ["--prior", str(tmp_path / "street.prior")]  # of one place: "away" is not in it
+    main([*command, "--out", str(tmp_path / "maps"), *prior])
+    assert "not used: 1 drive without results, such as 'away'\n" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "maps").glob("*.geojson")] == ["scene.geojson"]
+    named = [*command, "--out", str(tmp_path / "named"), "--scene", "scene", "away"]
+    with pytest.raises(ValueError, match=r"no sample of scene 'away' has results.* --scene"):
+        main(named)
+    assert not (tmp_path / "named").exists()
+
+
 def test_drives_of_a_place_are_joined_into_one_map(files, tmp_path, capsys):
     results, ann = files
     file = AnnotationFile(ann)
