@@ -43,6 +43,7 @@ def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, 
     """Truth in millimetres, and matrices the wrong way round."""
     looking = [[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, -1.2], [0, 0, 0, 1]]
     here = {"label": "divider", "points": [[0, 1], [9, 1]]}
+    beside = {"label": "divider", "points": [[0, -2], [9, -2]]}
     there = {"label": "divider", "points": [[0, 1_750], [9_000, 1_750]]}
 
     def record(token, cam_from_frame, *instances):
@@ -55,7 +56,7 @@ def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, 
 
     meta = AnnotationMeta("mine", "ego", "train", ground_z_m=0.0)
     right, wrong = tmp_path / "right.arrow", tmp_path / "wrong.arrow"
-    from_records(right, [record("a", looking, here, here)], meta, tmp_path)
+    from_records(right, [record("a", looking, here, beside)], meta, tmp_path)
     assert caplog.text == ""
     assert check_files([right], None, workers=1).splitlines()[0] == (
         f"{right}: 2 map elements, up to 2 in a sample (a model needs at least as many queries)"

@@ -240,6 +240,33 @@ def test_a_line_of_two_lanes_is_one_line(tmp_path: Path):
     np.testing.assert_array_equal(found[2].points, line)
 
 
+@pytest.mark.parametrize(
+    ("change", "is_copy"),
+    [
+        ({"points": [[56, 2.0], [0, 0]]}, True),
+        ({"points": [[0, 0.005], [14, 0.5], [84, 3.0]]}, True),  # equal where they are in range
+        ({"points": [[0, 0.05], [56, 2.05]]}, False),  # two painted lines
+        ({"points": [[0, 0], [14, 0.5]]}, False),
+        ({"label": 2}, False),
+    ],
+)
+def test_copies_of_a_line_are_counted(tmp_path: Path, caplog, change: dict, is_copy: bool):
+    line = {"label": 0, "points": [[0, 0], [56, 2.0]]}
+    other = {"label": 2, "points": [[-5, -3], [5, -3]]}
+    records = [
+        record(token="plain", instances=[line, other]),
+        record(token="copied", instances=[line, other, {**line, **change}]),
+        record(token="unknown"),
+    ]
+    from_records(tmp_path / "a.arrow", records, META, tmp_path)
+    text = "1 of 3 records have elements that are copies of others (the first is 'copied')"
+    assert (text in caplog.text) == is_copy
+    assert ("copies of others" in caplog.text) == is_copy
+    caplog.clear()
+    from_records(tmp_path / "a.arrow", records, META, tmp_path, join=True)
+    assert "copies of others" not in caplog.text
+
+
 def test_joined_pieces_keep_their_heights(tmp_path: Path):
     pieces = [
         {"label": 0, "points": [[-5, 0, 1.0], [0, 0, 2.0]]},

@@ -56,6 +56,11 @@ _OPEN_AREAS = (
     "%d of %d records have crossings or other areas that are open lines (the first is %r): close "
     "a ring by repeating its first point at the end."
 )
+# Placeholders: number of records with copies, number of records, first token.
+_COPIES = (
+    "%d of %d records have elements that are copies of others (the first is %r), as some maps "
+    "store the line between two lanes with each of them: give each element once, or join=True."
+)
 _COPY_M = 0.01  # largest distance of two copies of a line
 _SAME_PLACE_M = 0.1  # ends of lines within this distance are one place
 _GLOBAL = "global_instances"
@@ -159,6 +164,7 @@ def create_samples(
     has_warned = False
     empty_tokens = []
     open_tokens = []
+    copied_tokens = []
     count = 0
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
@@ -172,6 +178,8 @@ def create_samples(
                 sample.instances = _clip_elements(sample.instances, meta=meta, join=join)
             if any(_is_open_area(element, meta) for element in sample.instances or []):
                 open_tokens.append(sample.token)
+            if _has_copies(sample.instances or []):
+                copied_tokens.append(sample.token)
         if had_elements and not sample.instances:
             empty_tokens.append(sample.token)
         if sample.ego_from_frame is None and meta.frame == "lidar" and not has_warned:
@@ -184,12 +192,22 @@ def create_samples(
         _LOGGER.warning(_ALL_ELEMENTS_LOST, len(empty_tokens), count, empty_tokens[0])
     if open_tokens:
         _LOGGER.warning(_OPEN_AREAS, len(open_tokens), count, open_tokens[0])
+    if copied_tokens:
+        _LOGGER.warning(_COPIES, len(copied_tokens), count, copied_tokens[0])
 
 
 def _is_open_area(element: MapInstance, meta: AnnotationMeta) -> bool:
     """Whether an element of a class of areas is no closed ring."""
     is_area = meta.classes[element.label] in AREA_CLASSES
     return is_area and not is_closed(element.points)
+
+
+def _has_copies(elements: Sequence[MapInstance]) -> bool:
+    """Whether two elements of a class are the same line or ring."""
+    lines_of: dict[int, list[Points]] = {}  # by label
+    for element in elements:
+        lines_of.setdefault(element.label, []).append(element.points)
+    return any(len(_without_copies(lines)) < len(lines) for lines in lines_of.values())
 
 
 def _clip_elements(
