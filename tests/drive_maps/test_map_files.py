@@ -94,7 +94,7 @@ def test_a_geojson_of_another_program_is_read_by_its_own_words(tmp_path):
         feature("LineString", [[1, 2, 99], [3, 4, 99]], kind="lane_line"),
         feature("MultiLineString", [LINE, [[0, 5], [10, 5]]], kind="kerb"),
         feature("MultiPolygon", [[RING, [[1, 1], [2, 1], [2, 2], [1, 1]]]], kind="zebra"),
-        feature("Polygon", [RING], kind=7),
+        feature("Polygon", [np.add(RING, 20).tolist()], kind=7),
         feature("LineString", LINE, kind="zebra"),
         feature("LineString", [[5, 5], [5, 5]], kind="kerb"),
         feature("Point", [0, 0], kind="tree"),
@@ -118,6 +118,26 @@ def test_a_geojson_of_another_program_is_read_by_its_own_words(tmp_path):
         "without geometry": 1,
     }
     assert describe_unused(unused).startswith("1 x holes of polygons, 1 x ")
+
+
+@pytest.mark.parametrize("suffix", ["geojson", "osm"])
+def test_copies_of_an_element_are_counted(tmp_path, suffix):
+    """Lines that run the other way and rings with another start are copies, unlike neighbours."""
+    line = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, -1.0]])
+    ring = np.array(RING, dtype=float)
+    turned = ring[[2, 3, 0, 1, 2]]
+    lines = [line, line[::-1], line + 2e-4, line + 0.01, line[:2]]
+    rings = [ring, ring[::-1], turned, turned[::-1], ring + 0.01]
+    elements = MapElements.from_polylines([*lines, line, *rings], [0] * 5 + [2] + [1] * 5)
+    path = tmp_path / f"map.{suffix}"
+    write = write_geojson if suffix == "geojson" else write_lanelet2
+    write(path, elements, CLASSES, ORIGIN)
+    found, unused = read_map(path, CLASSES, ORIGIN)
+    assert sorted(found.labels.tolist()) == [0, 0, 0, 1, 1, 2]
+    assert dict(unused) == {
+        "divider that is a copy of another": 2,
+        "ped_crossing that is a copy of another": 3,
+    }
 
 
 def test_degrees_without_a_system_are_longitude_and_latitude(tmp_path):
@@ -285,16 +305,17 @@ def test_a_lanelet2_map_of_another_program_is_read_by_its_types(tmp_path):
     ]
     path.write_text(osm("".join(body)))
     found, unused = read_map(path, CLASSES)
-    assert found.labels.tolist() == [1, 0, 2, 1]
+    assert found.labels.tolist() == [1, 0, 2]
     ring = [[0, 0], [0, 11], [7, 11], [7, 0], [0, 0]]
     for line, expected in zip(
-        found.polylines, [ring, [[0, 0], [0, 11]], [[7, 0], [7, 11]], ring], strict=True
+        found.polylines, [ring, [[0, 0], [0, 11]], [[7, 0], [7, 11]]], strict=True
     ):
         assert line.tolist() == expected
     assert dict(unused) == {
         "class 'traffic_light'": 1,
         "class 'traffic_sign/de294'": 1,
         "class ''": 1,
+        "ped_crossing that is a copy of another": 1,  # way 17 has the outline of lanelet 20
         "ped_crossing that is an open line": 1,
         "relation 'lanelet'": 1,
         "relation 'regulatory_element'": 2,

@@ -5,6 +5,7 @@ and count the elements that are not used. A reader creates an `ElementCollector`
 of the file it calls `class_of` and, if there is a class, `add`. At the end it calls `finish`.
 """
 
+import hashlib
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,7 @@ CLASS_KEY = "class"
 """Property with the class of an element in the files of `write_geojson` and `write_lanelet2`."""
 _MOST_VERTICES = 5_000_000  # limits the memory that an untrusted file can take
 _SMALLEST_M2 = 0.01  # a ring with a smaller area is a point or a line and is not used
+_COPY_DECIMALS = 3  # copies have equal coordinates when they are rounded to millimetres
 _LONGEST_NAME = 60  # largest number of characters of a value in a message
 _LISTED_REASONS = 8  # largest number of reasons in a message
 
@@ -171,7 +173,8 @@ class ElementCollector:
     def finish(self, origin: MapOrigin | MapGrid | None) -> MapFile:
         """Convert the lines to the global frame, check them, and create the map.
 
-        Areas of less than 0.01 square metres are counted as unused.
+        Areas of less than 0.01 square metres are counted as unused, and so are copies of a line or
+        an area: some maps store the line between two lanes with each of them.
 
         Args:
             origin: Position of the global frame on the Earth for lines in degrees; None for lines
@@ -188,6 +191,7 @@ class ElementCollector:
         lines = []
         labels = []
         scores = []
+        seen: set[tuple[int, bytes]] = set()  # labels and digests of the lines so far
         rows = zip(self._lines, self._labels, self._scores, strict=True)
         for line, label, score in rows:
             # Metres in the global frame. (n, 2)
@@ -202,6 +206,11 @@ class ElementCollector:
             if name in AREA_CLASSES and _area_m2(points) < _SMALLEST_M2:
                 self.unused[f"{name} without area"] += 1
                 continue
+            key = (label, _digest(points))
+            if key in seen:
+                self.unused[f"{name} that is a copy of another"] += 1
+                continue
+            seen.add(key)
             lines.append(points)
             labels.append(label)
             scores.append(score)
@@ -223,6 +232,19 @@ def _area_m2(ring: FloatArray) -> float:
         return 0.0
     area: float = shapely.Polygon(ring).area
     return area
+
+
+def _digest(line: FloatArray) -> bytes:
+    """Digest of a line that does not depend on its direction, or on the start of a ring. (n, 2)"""
+    vertices = np.round(line, _COPY_DECIMALS) + 0.0  # the sum makes 0.0 of -0.0
+    digests = []
+    for path in (vertices, vertices[::-1]):
+        if np.array_equal(path[0], path[-1]):
+            ring = path[:-1]
+            start = np.lexsort(ring.T)[0]  # first of the vertices by y, then by x
+            path = np.roll(ring, -start, axis=0)
+        digests.append(hashlib.blake2b(path.tobytes(), digest_size=16).digest())
+    return min(digests)
 
 
 def describe_unused(unused: Counter[str]) -> str:
