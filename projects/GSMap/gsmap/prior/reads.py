@@ -7,8 +7,8 @@ from dataclasses import dataclass
 class PriorReads:
     """Counts of the samples that a prior has been read at.
 
-    A prior with other axes or another origin than the poses of the samples is not an error: it has
-    nothing near them. These counts show it.
+    A prior whose global frame differs from that of the poses raises no error: it has nothing near
+    the samples. These counts show it.
 
     Attributes:
         samples: Number of samples.
