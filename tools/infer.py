@@ -466,13 +466,12 @@ def read_priors(
 
 def finish_priors(args: argparse.Namespace, priors: Sequence["AnyPrior"]) -> None:
     """Print which priors had nothing near samples; with ``--update-prior``, write their files."""
-    if not args.update_prior:
+    if not args.update_prior:  # a prior that is updated has nothing where the vehicle is new
         from gsmap.apis.map_priors import empty_reads
 
         for line in empty_reads(priors):
             print(line)
         return
-    # A prior that is updated has nothing where the vehicle is for the first time.
     for prior, path in zip(priors, args.prior, strict=True):
         prior.save(path)
     print(f"updated: {', '.join(map(str, args.prior))}")

@@ -203,8 +203,8 @@ def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bo
         notes.append(f"{note}: left out" if allowed else note)
     if notes and not allowed:
         raise InputError(
-            "; ".join(notes) + ": score the split that was predicted, or allow "
-            "the mismatch (--allow-mismatch)."
+            "; ".join(notes) + ": score the split that was predicted, or allow the mismatch "
+            "(--allow-mismatch)."
         )
     return notes
 
