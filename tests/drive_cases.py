@@ -67,6 +67,7 @@ def drive_of(noise_m: float = 0.0, scored: bool = False, seed: int = 0) -> Drive
     frames = []
     for number, angle in enumerate(np.arange(0.1, 0.7, 0.03)):
         ego_from_frame = np.eye(4)
+        ego_from_frame[:2, :2] = [[0, 1], [-1, 0]]  # y of the LiDAR is ahead
         ego_from_frame[2, 3] = 1.84
         sample = MapSample(
             f"token{number}", "scene", "town", 10**18 + number * 5 * 10**8, [], pose(angle),

@@ -43,6 +43,7 @@ from drivemaps.truth import true_map
 from drivemaps.video import write_video
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
+from gsmap.datasets.pose_plausibility import pose_warnings
 from gsmap.evaluation.core.results_json import RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
@@ -365,6 +366,7 @@ def write_map(
         if suffix == "geojson":
             write_geojson(path, elements, classes, origin=None)
         elif suffix == "osm":
+            assert origin is not None  # `check_options` refuses the format otherwise
             lanes = lane_graph_of(drive, elements)
             print(f"{format_count(len(lanes.lanelets), 'lanelet')} {lanes.source}: {path}")
             write_lanelet2(
@@ -669,11 +671,11 @@ def read_results(args: argparse.Namespace, ann: AnnotationFile) -> dict[str, Map
         if token not in results and scene in (args.scene or [scene]):
             missing.append(token)
     if missing:
-        number = format_count(len(missing), "sample")
-        print(f"not used: {number} without results, such as {missing[0]!r}")
+        count = format_count(len(missing), "sample")
+        print(f"not used: {count} without results, such as {missing[0]!r}")
     if others := [token for token in results if token not in scene_of]:
-        number = format_count(len(others), "result")
-        print(f"not used: {number} of samples that {args.ann} lacks, such as {others[0]!r}")
+        count = format_count(len(others), "result")
+        print(f"not used: {count} of samples that {args.ann} lacks, such as {others[0]!r}")
     if has_truth(ann) and not args.allow_other_split:  # maps are scored
         require_results_of(ann.meta.split_list, file.about, args.results)
     return results
@@ -712,6 +714,14 @@ def scenes_with_results(
         number = format_count(len(missing), "drive")
         print(f"not used: {number} without results, such as {missing[0]!r}")
     return [scene for scene in scenes if scene in found]
+
+
+def print_pose_warnings(ann: AnnotationFile, scenes: Sequence[str]) -> None:
+    """Print warnings of poses of drives that cannot be right, and so their maps."""
+    if ann.meta.has_poses:
+        samples = (sample for sample in ann if sample.scene in scenes)
+        for line in pose_warnings(samples, ann.meta.frame):
+            print(f"poses: {line}")
 
 
 def merge_drives(
@@ -776,6 +786,7 @@ def main(argv: list[str] | None = None) -> str:
     if args.results:
         results = read_results(args, ann)
         scenes = scenes_with_results(args, ann, results, scenes)
+        print_pose_warnings(ann, scenes)
     place = place_of(ann, scenes) if args.changes or args.prior else ""
     # Without a map_name of the samples, the prior is named after its file.
     prior_place = place or (args.prior.stem if args.prior else "")

@@ -9,18 +9,22 @@ with calibration.yaml, or a bag of ROS 1 or 2 (docs/inference.md).
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gsmap.apis.result_log import ResultLog
 from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.source import Source
+from gsmap.datasets.pose_plausibility import pose_warnings
+from gsmap.datasets.source import Mount, Source, frame_from_mount
 from gsmap.engine.arguments import add_config_options
 from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
+from gsmap.evaluation.core.results_json import vectors_of
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import register_folder, write_bytes
@@ -159,7 +163,7 @@ def _add_running_options(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="on a GPU, record the launches of a frame once and replay them",
     )
-    add_config_options(group)
+    add_config_options(parser)
 
 
 def _add_picture_options(parser: argparse.ArgumentParser) -> None:
@@ -258,7 +262,7 @@ def require_own_samples(path: Path) -> None:
 
 
 def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
-    """Print warnings about implausible properties of the cameras.
+    """Print warnings about implausible properties of the cameras and the poses.
 
     With ``--check-calibration``, also draw the ground plane over the images of the first drive.
 
@@ -273,6 +277,11 @@ def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
     warnings = list(dict.fromkeys(warnings))  # drives of one vehicle have equal ones
     for line in warnings:
         print(f"calibration: {line}")
+    if source.has_poses:
+        lines = pose_warnings(source.samples, source.frame)
+        for line in lines:
+            print(f"poses: {line}")
+        warnings += lines
     if args.check_calibration:
         figure = calibration_figure(samples[0], source.frame, root, source.ground_z_m)
         path = save_figure(figure, args.check_calibration)
@@ -368,6 +377,7 @@ def predict(
     chosen: list[int],
     results: ResultLog | None,
     priors: Sequence["AnyPrior"],
+    input_from_model: Mapping[str, np.ndarray],
 ) -> dict[str, str]:
     """Predict samples, draw them and log the predictions.
 
@@ -378,6 +388,8 @@ def predict(
         chosen: Indices of the samples to predict.
         results: Log of the predictions; None without ``--out``.
         priors: Maps of earlier drives.
+        input_from_model: Transforms of the predictions that are logged, by token
+            (`transforms_to_input`).
 
     Returns:
         The reason for each broken frame, by the token of its sample.
@@ -421,9 +433,41 @@ def predict(
             if args.show_dir:
                 draw(args, inferencer, dataset, sample)
             if results and token not in done:
-                results.add(token, inferencer.vectors(sample))
+                elements = inferencer.elements(sample)
+                if token in input_from_model:
+                    elements = elements.to_frame(input_from_model[token])
+                results.add(token, vectors_of(elements, dataset.metainfo["classes"]))
             bar.update()
     return broken
+
+
+def transforms_to_input(
+    source: Source, dataset: "VectorizedMapDataset", mount: Mount
+) -> dict[str, np.ndarray]:
+    """Transforms from the frame of the model to the frame of the samples of an annotation file.
+
+    Results of an annotation file belong to this file. Of other inputs, the samples in the frame of
+    the model are written beside the results.
+
+    Args:
+        source: The input.
+        dataset: The samples in the frame of the model.
+        mount: Annotation frame of the model, and its place in the vehicle.
+
+    Returns:
+        Transforms in metres (4, 4), by token; empty if the frames are equal.
+    """
+    samples = source.samples
+    if not isinstance(samples, AnnotationFile):
+        return {}
+    if dataset.annotations.path == samples.path.resolve():  # `open_dataset` changes no frame
+        return {}
+    transforms = {}
+    for sample in samples:
+        transforms[sample.token] = frame_from_mount(
+            sample, frame=source.frame, mount=mount, ground_z_m=source.ground_z_m
+        )
+    return transforms
 
 
 def remembers(inferencer: "MapInferencer") -> bool:
@@ -539,13 +583,15 @@ def main(argv: list[str] | None = None) -> str | None:
     # the calibration.
     log_settings = {**settings, "input": str(args.input.resolve()), "samples": samples_digest}
     log_settings["images"] = str(source.data_root)
+    log_settings["frame"] = source.frame
+    input_from_model = transforms_to_input(source, dataset, inferencer.model.mount)
     chosen_tokens = [tokens[index] for index in chosen]
     classes = dataset.metainfo["classes"]
     with ExitStack() as stack:
         log = open_log(args, log_settings, tokens=chosen_tokens, classes=classes)
         results = stack.enter_context(log)
         priors = read_priors(args, inferencer, dataset, chosen, stack)
-        broken = predict(args, inferencer, dataset, chosen, results, priors)
+        broken = predict(args, inferencer, dataset, chosen, results, priors, input_from_model)
         if chosen and len(broken) == len(chosen):
             raise no_usable_frame(broken, source.notes)
         if results:

@@ -77,7 +77,7 @@ def choose_start(cfg: Config, resume: str | None) -> None:
         newest = newest_checkpoint(cfg.work_dir, read_weights)  # skips files that cannot be read
         if newest is None and is_first_rank():
             print(f"{cfg.work_dir} holds no checkpoint: the run starts at its beginning.")
-        resume = newest
+        resume = None if newest is None else str(newest)
     cfg.resume = resume is not None
     cfg.load_from = resume or cfg.get("load_from")
     # A URL is not checked here, because only the runner downloads it. Any other value is a file or

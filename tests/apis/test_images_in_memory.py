@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import torch
 from inferencer_cases import drive, make_remembering, make_samples
+from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.source import Source, change_frame, ground_from_frame
-from gsmap.structures.rigid import rigid
+from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.structures.streams import Frame
 from gsmap.visualization.figure import figure_to_rgb
 
@@ -186,6 +187,23 @@ def test_a_live_rig_continues_a_stream_as_the_drive_does(inferencer, tmp_path):
     plain = inferencer.live(intrinsics, mounting, "vehicle")
     with pytest.raises(ValueError, match="the model has no memory"):
         plain(images[0], at=places[0], stream=stream)
+
+
+def test_a_live_rig_doubts_poses_that_no_vehicle_has(tmp_path, caplog):
+    remembering = make_remembering()
+    (sample,) = make_samples(tmp_path, 1)
+    images, intrinsics, cams = in_memory(sample, tmp_path)
+    for change, is_wrong in ((np.asarray, False), (invert_rigid, True)):
+        caplog.clear()
+        live, stream = remembering.live(intrinsics, cams, "lidar"), remembering.new_stream()
+        for number in range(25):
+            turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
+            pose = rigid(turn, turn @ [5, 2 * number, 0])  # straight on; y is ahead
+            live.predict(
+                images, at=Frame(str(number), "drive", number * 10**9, change(pose)), stream=stream
+            )
+        assert caplog.text.count("poses: ") == is_wrong
+        assert ("only if the poses are inverted, in drive 'drive'" in caplog.text) == is_wrong
 
 
 def test_a_live_map_is_in_the_frame_of_its_calibration(inferencer, tmp_path):

@@ -67,6 +67,12 @@ def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, 
     text = check_files([wrong], None, workers=1)
     assert "warning: 1 of 2 samples have no element in the range" in text
     assert "warning: calibration: camera 'front' " in text
+    equal = [record("a", looking, here), record("b", looking, here)]
+    for number, values in enumerate(equal):
+        values.update(scene="drive", timestamp_ns=number * 500_000_000)
+    from_records(wrong, equal, meta, tmp_path)
+    text = check_files([wrong], None, workers=1)
+    assert "warning: poses: the poses of all 2 samples are equal in drive 'drive'" in text
     caplog.clear()
     from_records(wrong, [record("a", looking, here)], AnnotationMeta("x", "ego", "v"), tmp_path)
     assert "does not contain the height of the road in the frame 'ego'" in caplog.text

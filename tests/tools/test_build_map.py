@@ -20,6 +20,7 @@ from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.prior import MapPrior, PriorSettings, open_prior
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.rigid import rigid
 from tools.build_map import main
 
 
@@ -54,6 +55,22 @@ def test_ground_truth_as_predictions_scores_1(files, tmp_path, capsys):
     assert picture.shape[1] == 1500
     orange = np.abs(picture[..., ::-1].astype(int) - [255, 149, 0]).max(axis=-1) < 4
     assert orange.mean() > 1e-3  # the dividers, in the colour of all pictures
+
+
+def test_poses_that_cannot_be_right_are_named(files, tmp_path, capsys):
+    results, ann = files
+
+    def exchange(pose):
+        return rigid(pose[:3, :3], pose[[1, 0, 2], 3])
+
+    for name, change in (("right", np.asarray), ("wrong", exchange)):
+        path = tmp_path / f"{name}.arrow"
+        file = AnnotationFile(ann)
+        samples = [replace(s, global_from_frame=change(s.global_from_frame)) for s in file]
+        write_annotations(path, file.meta, samples)
+        main([str(results), "--ann", str(path), "--out", str(tmp_path / name)])
+        is_named = "degrees sideways" in capsys.readouterr().out
+        assert is_named == (name == "wrong")
 
 
 def test_predictions_of_other_classes_are_left_out_and_counted(files, tmp_path, capsys):

@@ -5,13 +5,16 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from bag_cases import AXLE_M, Recorder, record
 from mmdet3d.registry import MODELS
 
 from gsmap import MapInferencer
-from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta
+from gsmap.datasets.source import change_frame
 from gsmap.engine.launch import read_config
 from gsmap.utils.shards import digest
 from tools import infer
@@ -56,6 +59,29 @@ def test_a_root_without_annotation_files_is_predicted_and_can_be_merged(
             assert a["confidence_level"] == pytest.approx(b["confidence_level"], abs=1e-5)
 
 
+def test_results_of_an_annotation_file_are_in_its_frame(
+    minicity_root, minicity_annotations, model, tmp_path
+):
+    """The LiDAR of nuScenes looks along its y axis, and is 0.94 m ahead of the rear axle."""
+    ego = [change_frame(s, "lidar", "ego") for s in AnnotationFile(minicity_annotations["val"])]
+    samples_of = {"ego": ego, "lidar": [change_frame(s, "ego", "lidar") for s in ego]}
+    found = {}
+    for frame, samples in samples_of.items():
+        path = tmp_path / f"{frame}.arrow"
+        write_annotations(path, AnnotationMeta("mine", frame, "val"), samples)
+        out = tmp_path / f"{frame}.json"
+        words = ["--data-root", str(minicity_root), "--model", *model, "--out", str(out)]
+        infer.main([str(path), *words])
+        found[frame] = results(out)
+    assert found["lidar"].keys() == found["ego"].keys()
+    for token, vectors in found["lidar"].items():
+        assert len(vectors) == len(found["ego"][token]) > 0
+        for in_lidar, in_ego in zip(vectors, found["ego"][token], strict=True):
+            x, y = np.array(in_lidar["pts"]).T
+            np.testing.assert_allclose(in_ego["pts"], np.stack([y + 0.94, -x], axis=1), atol=1e-2)
+            assert in_ego["confidence_level"] == in_lidar["confidence_level"]
+
+
 @pytest.mark.parametrize("repaired", [False, True])
 def test_a_killed_run_goes_on_and_broken_frames_are_named_and_tried_again(
     repaired, drive, model, minicity_root, tmp_path, capsys, monkeypatch
@@ -70,7 +96,7 @@ def test_a_killed_run_goes_on_and_broken_frames_are_named_and_tried_again(
     broken.unlink()
     out = tmp_path / "map.json"
     words = [str(drive), "--model", *model, "--out", str(out)]
-    original, calls = MapInferencer.vectors, []
+    original, calls = MapInferencer.elements, []
 
     def killed_at_the_third(self, sample):
         calls.append(sample.metainfo["token"])
@@ -78,14 +104,14 @@ def test_a_killed_run_goes_on_and_broken_frames_are_named_and_tried_again(
             raise KeyboardInterrupt
         return original(self, sample)
 
-    monkeypatch.setattr(MapInferencer, "vectors", killed_at_the_third)
+    monkeypatch.setattr(MapInferencer, "elements", killed_at_the_third)
     with pytest.raises(KeyboardInterrupt):
         infer.main(words)
     assert not out.exists()
     unfinished = tmp_path / "map.json.unfinished"
     unfinished.write_bytes(unfinished.read_bytes()[:-7])  # the kill cuts the last line
     monkeypatch.setattr(
-        MapInferencer, "vectors", lambda s, x: calls.append("again") or original(s, x)
+        MapInferencer, "elements", lambda s, x: calls.append("again") or original(s, x)
     )
     if repaired:
         broken.symlink_to(minicity_root / "samples/CAM_BACK" / broken.name)
@@ -114,7 +140,7 @@ def test_memory_sees_the_frames_before_after_a_kill_too(
     torch.save({"state_dict": MODELS.build(read_config(config).model).state_dict()}, weights)
     words = [str(drive), "--model", str(config), str(weights), "--out"]
     infer.main([*words, str(tmp_path / "whole.json")])
-    original, calls = MapInferencer.vectors, []
+    original, calls = MapInferencer.elements, []
 
     def killed_at_the_third(self, sample):
         calls.append(sample)
@@ -122,7 +148,7 @@ def test_memory_sees_the_frames_before_after_a_kill_too(
             raise KeyboardInterrupt
         return original(self, sample)
 
-    monkeypatch.setattr(MapInferencer, "vectors", killed_at_the_third)
+    monkeypatch.setattr(MapInferencer, "elements", killed_at_the_third)
     with pytest.raises(KeyboardInterrupt):
         infer.main([*words, str(tmp_path / "killed.json")])
     infer.main([*words, str(tmp_path / "killed.json")])

@@ -12,6 +12,7 @@ from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.plausibility import calibration_warnings
+from gsmap.datasets.pose_plausibility import pose_warnings
 from gsmap.utils.cli import EachOnce
 from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_machine_error
@@ -73,7 +74,7 @@ def _broken_files(sample: MapSample, root: Path) -> list[str]:
 
 
 def _describe_content(file: AnnotationFile) -> list[str]:
-    """Describe the number of elements, and warn about implausible elements and cameras."""
+    """Describe the number of elements, and warn of implausible elements, cameras and poses."""
     counts = file.instance_counts()
     counts = counts[counts >= 0]  # a sample whose ground truth is not known has -1
     lines = []
@@ -90,6 +91,9 @@ def _describe_content(file: AnnotationFile) -> list[str]:
             )
     for warning in calibration_warnings(file, file.meta.frame, file.meta.ground_z_m):
         lines.append(f"warning: calibration: {warning}")
+    if file.meta.has_poses:
+        for warning in pose_warnings(file, file.meta.frame):
+            lines.append(f"warning: poses: {warning}")
     return lines
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.datasets.source import Source, ground_from_frame, sample_in_vehicle
-from gsmap.structures.rigid import invert_rigid
+from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.visualization.figure import figure_to_rgb
 from mapdata.argoverse2.log import Argoverse2Log
 from mapdata.calibration_check import (
@@ -201,6 +201,25 @@ def test_images_of_another_size_are_noticed(town, minicity_root, tmp_path):
         source = Source(order, "lidar", data_root=tmp_path)
         found = infer.check_calibration(Namespace(check_calibration=None), source)
         assert [text for text in found if "has images of" in text] == [line]
+
+
+def test_poses_are_checked_beside_the_calibration(town, tmp_path, capsys):
+    poses = [rigid(np.eye(3), [0.0, 3.0 * number, 0.0]) for number in range(5)]  # y is ahead
+    for is_wrong in (False, True):
+        samples = []
+        for number, pose in enumerate(poses):
+            wrong = rigid(pose[:3, :3], pose[[1, 0, 2], 3])  # exchanged
+            pose = wrong if is_wrong else pose
+            time_ns = number * 10**9
+            sample = replace(town[0], token=str(number), timestamp_ns=time_ns)
+            samples.append(replace(sample, global_from_frame=pose))
+        source = Source(samples, "lidar", data_root=tmp_path)
+        found = infer.check_calibration(Namespace(check_calibration=None), source)
+        assert len(found) == is_wrong
+        printed = capsys.readouterr().out
+        assert ("poses: the vehicle moves 90 degrees sideways" in printed) == is_wrong
+        without = replace(source, has_poses=False)
+        assert infer.check_calibration(Namespace(check_calibration=None), without) == []
 
 
 def test_the_ground_is_drawn_where_the_cameras_see_it(town, minicity_root):

@@ -13,12 +13,17 @@ from mmengine.config import Config
 from gsmap.apis.map_priors import maps_for
 from gsmap.datasets.memory import VEHICLE, Cameras, bgr_by_name, source_in_memory
 from gsmap.datasets.plausibility import calibration_warnings
+from gsmap.datasets.pose_plausibility import MotionCheck
 from gsmap.datasets.source import Source, ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from gsmap.structures.streams import Frame, MapStream
 from gsmap.utils.errors import InputError
 
+# Poses of streams are checked once, after so many steps of the vehicle, or so many frames of a
+# vehicle that stands.
+_MOTION_STEPS = 20
+_MOTION_FRAMES = 1000
 _LOGGER = logging.getLogger(__name__)
 # Frame of a temporal model without a stream. The model requires a scene, a time and a pose, but
 # does not use them for an independent sample.
@@ -128,10 +133,12 @@ class LiveMap:
         self._lock = threading.Lock()  # held while the data set has the images of a frame
         self._sizes: dict[str, tuple[int, ...]] = {}  # shape of the last image of each camera
         self._logged_warnings: set[str] = set()
+        self._motion: MotionCheck | None = MotionCheck()  # None after enough frames
         # Set by `_prepare`: the data set of one sample, and the transform from the annotation frame
-        # of the model to the frame of the calibration. (4, 4)
+        # of the model to the frame of the calibration, and from there to the ground. (4, 4)
         self._dataset: VectorizedMapDataset
         self._calibration_from_model: np.ndarray
+        self._ground_from_calibration: np.ndarray
 
     def __getstate__(self) -> dict[str, Any]:
         """Attributes of a copy, which prepares the calibration at its first frame."""
@@ -253,6 +260,8 @@ class LiveMap:
             update_priors=self._update_prior,
         )
         (data_sample,) = predictions  # the data set has one sample
+        if at is not None and stream is not None:
+            self._check_motion(at)
         for prior in self._priors:  # one at most
             is_empty = prior.reads.empty > num_empty
             # A prior that is updated has nothing where the vehicle is for the first time.
@@ -267,6 +276,27 @@ class LiveMap:
         # `adopt_settings` sets the first key if the checkpoint records signals.
         keys = ("signals_from_poses", "pose_only_signals")
         return any(self._config.get(key) for key in keys)
+
+    def _check_motion(self, at: Frame) -> None:
+        """Log a warning if the poses of the first frames of streams cannot be right.
+
+        Args:
+            at: A frame, with the pose of the frame of the calibration.
+        """
+        if self._motion is None:
+            return
+        self._motion.add(
+            at.scene,
+            at.timestamp_ns,
+            token=at.token,
+            global_from_frame=at.pose,
+            ground_from_frame=self._ground_from_calibration,
+        )
+        has_moved = self._motion.num_steps >= _MOTION_STEPS
+        if has_moved or self._motion.num_poses >= _MOTION_FRAMES:
+            for text in self._motion.warnings():
+                self._warn_once(f"poses: {text}")
+            self._motion = None if has_moved else MotionCheck()
 
     def _warn_once(self, text: str) -> None:
         """Log a warning, unless it was logged before."""
@@ -331,6 +361,7 @@ class LiveMap:
             ground_z_m=dataset.metainfo["ground_z_m"],
         )
         self._dataset = dataset
+        self._ground_from_calibration = ground_from_calibration
         self._calibration_from_model = invert_rigid(ground_from_calibration) @ ground_from_model
 
 

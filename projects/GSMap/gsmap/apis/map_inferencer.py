@@ -609,6 +609,7 @@ class MapInferencer:
             stream: Drive that the samples continue, as `predict` takes it.
 
         Returns:
-            The samples in order, with ``pred_instances_3d`` on the CPU.
+            The samples in order, with ``pred_instances_3d`` on the CPU, in the annotation frame of
+            the model.
         """
         return list(self.predict(self.dataset(source, data_root=data_root), stream=stream))

@@ -168,6 +168,24 @@ class Mount:
         return abs(sample_road_z_m - model_road_z_m) < _HEIGHT_TOLERANCE_M
 
 
+def frame_from_mount(
+    sample: MapSample, frame: str, mount: Mount, ground_z_m: float | None = None
+) -> np.ndarray:
+    """Return the transform from the annotation frame of a model to that of a sample.
+
+    Args:
+        sample: Sample.
+        frame: Annotation frame of the sample, ``lidar`` or ``ego``.
+        mount: Annotation frame of the model, and its place in the vehicle.
+        ground_z_m: Height of the road in ``frame`` in metres; None for the usual height.
+
+    Returns:
+        Transform in metres. (4, 4)
+    """
+    ground_from_sample = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
+    return invert_rigid(ground_from_sample) @ mount.matrix
+
+
 def change_frame(
     sample: MapSample, frame: str, wanted: str | Mount, ground_z_m: float | None = None
 ) -> MapSample:
@@ -190,8 +208,7 @@ def change_frame(
     mount = Mount(wanted) if isinstance(wanted, str) else wanted
     if mount.suits(frame, ground_z_m):
         return sample
-    ground_from_old = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
-    frame_from_new = invert_rigid(ground_from_old) @ mount.matrix
+    frame_from_new = frame_from_mount(sample, frame=frame, mount=mount, ground_z_m=ground_z_m)
     lidar = sample.lidar
     if lidar is not None:
         lidar = _transform_lidar(lidar, new_from_frame=invert_rigid(frame_from_new))

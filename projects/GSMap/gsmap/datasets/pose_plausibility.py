@@ -1,0 +1,207 @@
+"""Plausibility checks of the poses of drives.
+
+A wrong pose raises no error: memory over frames, priors and maps of drives are only in the wrong
+place. A vehicle mostly moves where it looks. This shows inverted poses, quaternions in another
+order, and exchanged axes of the world.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.source import ground_from_frame
+from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.words import format_count
+
+_MIN_STEP_M = 0.5  # the direction of shorter steps is noise
+_MIN_STEPS = 3  # fewer steps of a drive say nothing about its direction
+_MAX_SIDEWAYS_DEG = 30.0  # median angle between a step and the direction in which the vehicle looks
+_MAX_TILT_DEG = 30.0  # median angle between the vertical axes of the vehicle and the world
+_MAX_SPEED_M_S = 100.0
+_MIN_JUMP_M = 10.0  # shorter jumps are corrections of a localisation
+
+_Fault = tuple[str, str]  # description, and the likely cause
+
+
+@dataclass
+class _Drive:
+    """Poses of a drive, in the order in which they were added."""
+
+    times_ns: list[int] = field(default_factory=list)
+    tokens: list[str] = field(default_factory=list)
+    global_from_frame: list[np.ndarray] = field(default_factory=list)  # (4, 4) each
+    frame_from_ground: list[np.ndarray] = field(default_factory=list)  # (4, 4) each
+
+
+class MotionCheck:
+    """Collects poses of drives, and describes motions that no vehicle makes.
+
+    Attributes:
+        num_poses: Number of added poses.
+        num_steps: Number of added poses that are at least 0.5 m from the pose before them.
+    """
+
+    def __init__(self) -> None:
+        self.num_poses = 0
+        self.num_steps = 0
+        self._drives: dict[str, _Drive] = {}  # by name
+
+    def add(
+        self,
+        drive: str,
+        timestamp_ns: int,
+        token: str,
+        global_from_frame: np.ndarray,
+        ground_from_frame: np.ndarray,
+    ) -> None:
+        """Add a pose of a drive. The order does not matter.
+
+        Args:
+            drive: Name of the drive; if it is empty, the order of its poses is not known, and the
+                motion is not checked.
+            timestamp_ns: Time of the pose in nanoseconds.
+            token: Name of the sample, for a warning.
+            global_from_frame: Transform in metres from the annotation frame to the world. (4, 4)
+            ground_from_frame: Transform in metres from the annotation frame to the ground below the
+                vehicle (x ahead, y left, z up). (4, 4)
+        """
+        poses = self._drives.setdefault(drive, _Drive())
+        if poses.global_from_frame:
+            step = global_from_frame[:3, 3] - poses.global_from_frame[-1][:3, 3]
+            self.num_steps += bool(np.linalg.norm(step) >= _MIN_STEP_M)
+        self.num_poses += 1
+        poses.times_ns.append(timestamp_ns)
+        poses.tokens.append(token)
+        poses.global_from_frame.append(global_from_frame)
+        poses.frame_from_ground.append(invert_rigid(ground_from_frame))
+
+    def warnings(self) -> list[str]:
+        """Describe each kind of implausible motion in one line."""
+        texts_of: dict[str, list[str]] = {}  # descriptions, by the likely cause
+        for name, drive in self._drives.items():
+            for text, cause in _faults_of(name, drive):
+                texts_of.setdefault(cause, []).append(f"{text} in drive {name!r}")
+        lines = []
+        for cause, texts in texts_of.items():
+            others = f" and in {len(texts) - 1} more" if len(texts) > 1 else ""
+            number = format_count(len(self._drives), "drive")
+            lines.append(f"{texts[0]}{others} of {number}: {cause}")
+        return lines
+
+
+def pose_warnings(samples: Iterable[MapSample], frame: str) -> list[str]:
+    """Find implausible motions of the vehicles of samples.
+
+    Args:
+        samples: Samples of one or more drives, with poses.
+        frame: Annotation frame of the samples, ``lidar`` or ``ego``.
+
+    Returns:
+        Warnings, one line for each kind of fault.
+    """
+    check = MotionCheck()
+    for sample in samples:
+        check.add(
+            sample.scene,
+            sample.timestamp_ns,
+            token=sample.token,
+            global_from_frame=sample.global_from_frame,
+            ground_from_frame=ground_from_frame(sample, frame=frame),
+        )
+    return check.warnings()
+
+
+def _faults_of(name: str, drive: _Drive) -> list[_Fault]:
+    """Faults of a drive."""
+    order = np.argsort(drive.times_ns, kind="stable")
+    times_ns = np.array(drive.times_ns)[order]
+    times_s = (times_ns - times_ns[0]) / 1e9
+    tokens = [drive.tokens[index] for index in order]
+    global_from_frame = np.stack(drive.global_from_frame)[order]
+    frame_from_ground = np.stack(drive.frame_from_ground)[order]
+    poses = global_from_frame @ frame_from_ground
+    faults = list(_tilt_faults(poses)) + list(_equality_faults(poses))
+    # Without names or times of drives, the order of the poses is not known.
+    if faults or not name or times_s[-1] == 0:
+        return faults
+    faults = list(_motion_faults(times_s, tokens, poses))
+    inverse = invert_rigid(global_from_frame) @ frame_from_ground
+    has_moved = np.ptp(poses[:, :3, 3], axis=0).max() >= _MIN_STEPS * _MIN_STEP_M
+    if faults and has_moved and not list(_motion_faults(times_s, tokens, inverse)):
+        text = "a vehicle moves like this only if the poses are inverted,"
+        return [(text, "they must map points of the frame to the world")]
+    return faults
+
+
+def _tilt_faults(poses: np.ndarray) -> Iterator[_Fault]:
+    """Yield a fault if the vehicle does not stand upright.
+
+    Args:
+        poses: Transforms from the ground below the vehicle to the world. (n, 4, 4)
+    """
+    cosines = np.clip(poses[:, 2, 2], -1.0, 1.0)  # of the angle between both vertical axes
+    tilt_deg = np.degrees(np.median(np.arccos(cosines)))
+    if tilt_deg > _MAX_TILT_DEG:
+        yield (
+            f"the vehicle is tilted by {tilt_deg:.0f} degrees",
+            "does z of the world point up, and is the quaternion in the right order?",
+        )
+
+
+def _equality_faults(poses: np.ndarray) -> Iterator[_Fault]:
+    """Yield a fault if the poses of several samples are equal. (n, 4, 4)"""
+    if len(poses) > 1 and (poses == poses[0]).all():
+        yield (
+            f"the poses of all {len(poses)} samples are equal",
+            "are poses (global_from_frame) missing? Memory, priors and maps of drives need them",
+        )
+
+
+def _motion_faults(times_s: np.ndarray, tokens: list[str], poses: np.ndarray) -> Iterator[_Fault]:
+    """Yield the faults in the motion of a drive.
+
+    Args:
+        times_s: Ascending times in seconds. (n,)
+        tokens: Names of the samples.
+        poses: Transforms in metres from the ground below the vehicle to the world. (n, 4, 4)
+    """
+    steps = np.diff(poses[:, :3, 3], axis=0)  # in the world (n - 1, 3)
+    lengths_m = np.linalg.norm(steps, axis=1)
+    is_step = lengths_m >= _MIN_STEP_M
+    with np.errstate(divide="ignore", invalid="ignore"):  # samples of one time
+        speeds_m_s = lengths_m / np.diff(times_s)
+    is_fast = is_step & (speeds_m_s > _MAX_SPEED_M_S)
+    is_jump = is_fast & (lengths_m > _MIN_JUMP_M)
+    if 2 * is_fast.sum() > is_step.sum():
+        yield (
+            f"{is_fast.sum()} of {format_count(int(is_step.sum()), 'step')} are faster than "
+            f"{_MAX_SPEED_M_S:.0f} m/s",
+            "are times in nanoseconds and positions in metres?",
+        )
+    elif is_jump.any():
+        first = int(is_jump.argmax())
+        yield (
+            f"the vehicle jumps {format_count(int(is_jump.sum()), 'time')}, such as by "
+            f"{lengths_m[first]:.0f} m from sample {tokens[first]!r} to {tokens[first + 1]!r},",
+            "is it one drive, and does each sample have the pose of its time?",
+        )
+    is_used = is_step & ~is_jump
+    if is_used.sum() < _MIN_STEPS:
+        return
+    # The vehicle turns during a step: halfway it looks between the directions at both ends.
+    halfway = poses[:-1, :3, :3] + poses[1:, :3, :3]
+    ahead_m = (steps * halfway[:, :, 0]).sum(axis=1)
+    left_m = (steps * halfway[:, :, 1]).sum(axis=1)
+    angle_deg = np.degrees(np.median(np.abs(np.arctan2(left_m, ahead_m)[is_used])))
+    if angle_deg > 180.0 - _MAX_SIDEWAYS_DEG:
+        yield (
+            f"the vehicle moves backwards (median of {is_used.sum()} steps)",
+            "does x of the ground point ahead, and does time go forward?",
+        )
+    elif angle_deg > _MAX_SIDEWAYS_DEG:
+        yield (
+            f"the vehicle moves {angle_deg:.0f} degrees sideways (median of {is_used.sum()} steps)",
+            "are axes exchanged, or is a quaternion in another order?",
+        )

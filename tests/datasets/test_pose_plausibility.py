@@ -1,0 +1,133 @@
+"""Implausible motions of vehicles are noticed, those of real and generated drives pass."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.pose_plausibility import MotionCheck, pose_warnings
+from gsmap.datasets.source import sample_in_vehicle
+from gsmap.structures.rigid import invert_rigid, rigid
+from mapdata.argoverse2.log import Argoverse2Log
+
+LOGS = "av2/sensor/val"
+
+
+def circle(drive: str = "drive", num: int = 20) -> list[MapSample]:
+    """Samples along a left curve of 40 m radius, 4 m apart, each half a second."""
+    samples = []
+    for number in range(num):
+        angle = 0.3 + number * 0.1
+        position = [500 + 40 * np.sin(angle), 900 - 40 * np.cos(angle), 12.0]
+        pose = rigid(Rotation.from_euler("z", angle).as_matrix(), position)
+        sample = sample_in_vehicle(f"{drive}{number}", drive, number * 500_000_000, [], None)
+        samples.append(replace(sample, global_from_frame=pose))
+    return samples
+
+
+def with_poses(samples, change):
+    """Samples with changed poses."""
+    return [replace(s, global_from_frame=change(s.global_from_frame)) for s in samples]
+
+
+def turned(pose, rotation):
+    """A pose with another rotation (3, 3)."""
+    return rigid(rotation, pose[:3, 3])
+
+
+def other_order(pose):
+    """A pose whose quaternion x, y, z, w is read as w, x, y, z."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return turned(pose, Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix())
+
+
+def exchanged(pose):
+    """A pose whose position has the northing first, as in EPSG:2180."""
+    return rigid(pose[:3, :3], pose[[1, 0, 2], 3])
+
+
+QUARTER = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+WRONG = {
+    "inverted": (invert_rigid, "only if the poses are inverted"),
+    "quaternion": (other_order, "is tilted by"),
+    "axes": (exchanged, "degrees sideways"),
+    "no rotation": (lambda pose: turned(pose, np.eye(3)), "degrees sideways"),
+    "lidar axes": (lambda pose: turned(pose, pose[:3, :3] @ QUARTER), "90 degrees sideways"),
+    "north east down": (
+        lambda pose: rigid(np.diag([1, -1, -1]), np.zeros(3)) @ pose,
+        "180 degrees",
+    ),
+    "millimetres": (lambda pose: rigid(pose[:3, :3], 1000 * pose[:3, 3]), "faster than 100 m/s"),
+    "missing": (lambda pose: np.eye(4), "poses of all 20 samples are equal"),
+    "turned round": (lambda pose: turned(pose, pose[:3, :3] @ QUARTER @ QUARTER), "backwards"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_poses_are_noticed(name):
+    change, text = WRONG[name]
+    samples = circle()
+    assert pose_warnings(samples, "ego") == []
+    lines = pose_warnings(with_poses(samples, change), "ego")
+    assert text in lines[0]
+    assert "in drive 'drive' of 1 drive: " in lines[0]
+
+
+def test_wrong_times_and_jumps_are_noticed():
+    samples = circle()
+    too_fast = [replace(s, timestamp_ns=s.timestamp_ns // 1_000_000) for s in samples]
+    (line,) = pose_warnings(too_fast, "ego")
+    assert line.startswith("19 of 19 steps are faster than 100 m/s")
+    (line,) = pose_warnings([replace(s, timestamp_ns=-s.timestamp_ns) for s in samples], "ego")
+    assert line.startswith("the vehicle moves backwards (median of 19 steps)")
+    # Two drives under one name, one after the other.
+    second = with_poses(circle(), lambda pose: rigid(np.eye(3), [700.0, 0.0, 0.0]) @ pose)
+    later = [
+        replace(s, token=f"{s.token}b", timestamp_ns=s.timestamp_ns + 10_000_000_000)
+        for s in second
+    ]
+    (line,) = pose_warnings(samples + later, "ego")
+    assert line.startswith("the vehicle jumps 1 time, such as by 6")
+    assert "from sample 'drive19' to 'drive0b', in drive 'drive' of 1 drive: is it one" in line
+
+
+def test_a_file_has_one_line_for_each_kind_of_fault():
+    samples = circle("a") + with_poses(circle("b"), invert_rigid)
+    samples += with_poses(circle("c"), invert_rigid) + circle("d")
+    (line,) = [text for text in pose_warnings(samples, "ego") if "inverted" in text]
+    assert " in drive 'b' and in 1 more of 4 drives: they must map" in line
+
+
+def test_what_says_nothing_about_the_motion_is_no_fault():
+    samples = circle()
+    single_scene = [replace(s, scene="") for s in with_poses(samples, invert_rigid)]
+    at_one_time = [replace(s, timestamp_ns=0) for s in with_poses(samples, invert_rigid)]
+    standing = []
+    for number, sample in enumerate(samples):
+        pose = sample.global_from_frame.copy()
+        pose[:2, 3] = 0.01 * number, -0.01 * number  # noise of a localisation
+        standing.append(replace(sample, global_from_frame=pose))
+    corrected = list(samples)
+    shift = rigid(np.eye(3), [8.0, 0.0, 0.0])  # the localisation corrects its position by 8 m
+    corrected[10:] = with_poses(samples[10:], lambda pose: shift @ pose)
+    for found in (single_scene, at_one_time, standing, corrected, samples[:1], []):
+        assert pose_warnings(found, "ego") == []
+    # The order of the samples does not count.
+    assert pose_warnings(samples[::-1], "ego") == []
+
+
+def test_right_drives_pass(minicity_annotations, shared_dir):
+    for path in minicity_annotations.values():
+        file = AnnotationFile(path)
+        assert pose_warnings(file, file.meta.frame) == []
+    num_steps = 0
+    for folder in sorted((shared_dir / LOGS).iterdir()):
+        check = MotionCheck()
+        for time_ns, pose in sorted(Argoverse2Log(folder).poses.items())[::50]:
+            check.add(folder.name, time_ns, str(time_ns), pose, ground_from_frame=np.eye(4))
+        assert check.warnings() == []
+        num_steps += check.num_steps
+    assert num_steps > 20
