@@ -18,6 +18,7 @@ from comparison.run_curves import plot_runs, plot_series, read_run, summary_tabl
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
+from gsmap.utils.words import format_count
 from gsmap.visualization.figure import save_figure
 
 
@@ -49,6 +50,10 @@ def main() -> None:
     runs = [read_run(path, name) for path, name in zip(args.runs, names, strict=True)]
     table = summary_table(runs)  # Markdown text
     print(table)  # before anything is written: a disk may be full
+    for run in runs:
+        if run.num_replaced:
+            trainings = format_count(run.num_replaced, "earlier training")
+            print(f"not shown: {trainings} in the folder of {run.name}")
     if args.table:
         write_text(args.table, table + "\n")
     if args.out:

@@ -348,6 +348,17 @@ def run_settings(args: argparse.Namespace) -> dict[str, str]:
     return settings
 
 
+def picture_settings(args: argparse.Namespace) -> str:
+    """Settings of the pictures; empty without pictures.
+
+    A predicted sample of an earlier run with these settings has its picture already.
+    """
+    if not args.show_dir:
+        return ""
+    names = ("show_dir", "format", "order", "score_thr", "width", "ground_z", "lidar")
+    return ", ".join(f"{name}={getattr(args, name)}" for name in names)
+
+
 def open_log(
     args: argparse.Namespace,
     settings: dict[str, str],
@@ -584,6 +595,7 @@ def main(argv: list[str] | None = None) -> str | None:
     log_settings = {**settings, "input": str(args.input.resolve()), "samples": samples_digest}
     log_settings["images"] = str(source.data_root)
     log_settings["frame"] = source.frame
+    log_settings["pictures"] = picture_settings(args)
     input_from_model = transforms_to_input(source, dataset, inferencer.model.mount)
     chosen_tokens = [tokens[index] for index in chosen]
     classes = dataset.metainfo["classes"]

@@ -69,7 +69,8 @@ def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, 
     assert "warning: calibration: camera 'front' " in text
     equal = [record("a", looking, here), record("b", looking, here)]
     for number, values in enumerate(equal):
-        values.update(scene="drive", timestamp_ns=number * 500_000_000)
+        time_ns = number * 500_000_000
+        values.update(scene="drive", timestamp_ns=time_ns, global_from_frame=np.eye(4))
     from_records(wrong, equal, meta, tmp_path)
     text = check_files([wrong], None, workers=1)
     assert "warning: poses: the poses of all 2 samples are equal in drive 'drive'" in text

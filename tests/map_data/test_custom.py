@@ -328,6 +328,64 @@ def test_a_map_in_global_coordinates_is_moved_into_each_frame(tmp_path: Path):
             from_records(tmp_path / "w.arrow", [record(**changes)], META, tmp_path)
 
 
+def test_poses_are_known_of_all_records_or_of_none(tmp_path: Path):
+    path = tmp_path / "poses.arrow"
+    posed = record(token="a", global_from_frame=np.eye(4))
+    plain = record(token="b")
+    from_records(path, iter([posed, {**posed, "token": "c"}]), META, tmp_path)
+    assert AnnotationFile(path).meta.has_poses
+    from_records(path, [plain, {**plain, "token": "c", "global_from_frame": None}], META, tmp_path)
+    assert not AnnotationFile(path).meta.has_poses
+    for records, text in (
+        ([posed, plain], "record 'b'.*it has no global_from_frame, unlike the first"),
+        ([plain, posed], "record 'a'.*it has a global_from_frame, unlike the first"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            from_records(tmp_path / "refused.arrow", records, META, tmp_path)
+        assert not (tmp_path / "refused.arrow").exists()
+
+
+def test_an_ideal_fisheye_is_rectified(tmp_path: Path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((90, 160, 3), 90, np.uint8))
+    matrix = np.array([[100.0, 0, 80], [0, 100, 45], [0, 0, 1]])
+    camera = {"name": "front", "path": "a.png", "intrinsics": matrix, "cam_from_frame": np.eye(4)}
+    for model, numbers, is_rectified in (
+        ("equidistant", [0, 0, 0, 0], True), ("plumb_bob", [0, 0, 0, 0], False),
+        ("plumb_bob", None, False), (None, [], False),
+    ):  # fmt: skip
+        lens = {"distortion_model": model, "distortion": numbers}
+        from_records(tmp_path / "d.arrow", [{"token": "t", "cameras": [camera | lens]}], META,
+                     tmp_path)  # fmt: skip
+        (seen,) = AnnotationFile(tmp_path / "d.arrow")[0].cameras
+        assert (seen.path != "a.png") == is_rectified
+    for model, message in (("equidistant", "give its four coefficients"), ("omni", None)):
+        lens = {"distortion_model": model} | ({} if message else {"distortion": [0, 0, 0, 0]})
+        with pytest.raises(ValueError, match=message or "distortion model 'omni'"):
+            from_records(tmp_path / "d.arrow", [{"token": "t", "cameras": [camera | lens]}], META,
+                         tmp_path)  # fmt: skip
+
+
+def test_rings_of_own_classes_that_are_cut_along_the_range_are_named(tmp_path: Path, caplog):
+    meta = replace(META, classes=("boundary", "curb", "ped_crossing"))
+    block = [[-50, 5], [50, 5], [50, 105], [-50, 105], [-50, 5]]
+    small = [[5, 5], [9, 5], [9, 8], [5, 5]]
+    far = [[50, 50], [90, 50], [90, 80], [50, 50]]
+    path = tmp_path / "rings.arrow"
+    for label, points, is_named in (
+        ("boundary", block, False), ("ped_crossing", block, False), ("curb", small, False),
+        ("curb", block[:3], False), ("curb", block, True),
+    ):  # fmt: skip
+        caplog.clear()
+        others = [
+            {"label": "curb", "points": far},
+            {"label": "boundary", "points": [[0, 0], [1, 0]]},
+        ]
+        instances = [{"label": label, "points": points}, *others]
+        from_records(path, [record(instances=instances)], meta, tmp_path)
+        text = "1 of 1 records have rings of your own classes that leave the range (the first"
+        assert (text in caplog.text) == is_named
+
+
 def test_images_of_a_distorted_camera_are_rectified_once(tmp_path: Path):
     board = (np.indices((90, 160)).sum(0) // 10 % 2 * 255).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), cv2.merge([board] * 3))

@@ -130,6 +130,27 @@ def test_a_killed_run_goes_on_and_broken_frames_are_named_and_tried_again(
     assert not unfinished.exists()
 
 
+@pytest.mark.parametrize("drawn_before", [False, True])
+def test_a_run_that_goes_on_lacks_no_picture(drive, model, tmp_path, monkeypatch, drawn_before):
+    pictures = tmp_path / "pictures"
+    words = [str(drive), "--model", *model, "--out", str(tmp_path / "map.json")]
+    draw = ["--show-dir", str(pictures), "--width", "400"]
+    original, calls = MapInferencer.elements, []
+
+    def killed_at_the_third(self, sample):
+        calls.append(sample)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return original(self, sample)
+
+    monkeypatch.setattr(MapInferencer, "elements", killed_at_the_third)
+    with pytest.raises(KeyboardInterrupt):
+        infer.main([*words, *draw] if drawn_before else words)
+    infer.main([*words, *draw])
+    assert len(list(pictures.glob("*.png"))) == 4
+    assert len(calls) == 3 + (2 if drawn_before else 4)
+
+
 def test_memory_sees_the_frames_before_after_a_kill_too(
     drive, tiny_config, tmp_path, capsys, monkeypatch
 ):

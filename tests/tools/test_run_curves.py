@@ -16,6 +16,7 @@ from comparison.tables import plot_iterations
 from gsmap.evaluation import ChamferConfig, MapEvaluator
 from gsmap.structures.elements import MapElements
 from gsmap.visualization.figure import figure_to_rgb
+from tools import analyze_run
 
 
 def write_log(folder, start, records):
@@ -53,6 +54,34 @@ def test_resumed_run_is_joined_and_the_later_record_counts(run):
     assert values.tolist() == [8, 4, 1, 1]
     assert log.series("chamfer/mAP", validation=True)[1].tolist() == [0.25, 0.75, 0.5]
     assert log.metrics == ["chamfer/mAP"]
+
+
+def test_a_new_training_in_the_folder_of_another_replaces_it(tmp_path, monkeypatch, capsys):
+    def log(start, losses, scores, interval=50, epoch=1):
+        records = []
+        for number, loss in enumerate(losses, start=1):
+            records.append(
+                {"loss": loss, "epoch": epoch, "step": (epoch - 1) * 200 + number * interval}
+            )
+        for number, score in enumerate(scores):
+            records.append({"mAP": score, "step": epoch + number})
+        write_log(tmp_path / "run", start, records)
+
+    log("20260101_000000", [9.0] * 20, [0.1, 0.9])
+    log("20260102_000000", [3.0] * 6, [0.2, 0.3])
+    found = read_run(tmp_path / "run")
+    assert found.num_replaced == 1
+    assert found.series("loss")[1].tolist() == [3.0] * 6
+    assert found.series("mAP", validation=True)[1].tolist() == [0.2, 0.3]
+    # Resumed from the end of the first epoch, and stopped before the next validation.
+    log("20260103_000000", [2.0], [], epoch=2)
+    found = read_run(tmp_path / "run")
+    assert found.num_replaced == 1
+    assert found.series("loss")[1].tolist() == [3.0] * 4 + [2.0]
+    assert found.series("mAP", validation=True)[1].tolist() == [0.2]
+    monkeypatch.setattr("sys.argv", ["analyze_run.py", str(tmp_path / "run")])
+    analyze_run.main()
+    assert "not shown: 1 earlier training in the folder of run" in capsys.readouterr().out
 
 
 def test_table_gives_last_and_best(run):

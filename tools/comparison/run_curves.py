@@ -32,11 +32,13 @@ class RunLog:
         name: Name for legends and tables.
         train: Records of training, with ``step`` (iteration) and scalars such as ``loss``.
         val: Records of validation, with ``step`` (epoch or iteration) and metrics.
+        num_replaced: Number of earlier trainings in the work folder, which are left out.
     """
 
     name: str
     train: Sequence[Mapping[str, float]]
     val: Sequence[Mapping[str, float]]
+    num_replaced: int = 0
 
     def series(self, key: str, validation: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Steps and finite values of one scalar.
@@ -103,7 +105,8 @@ def _records(path: Path) -> list[dict[str, float]]:
 def read_run(path: str | Path, name: str | None = None) -> RunLog:
     """Read the log of a run.
 
-    A resumed run may log a step a second time. The later record of the step is used.
+    A resumed run goes on from a checkpoint: earlier records from its first step on are left out.
+    If the run began anew in the work folder, these are all records of the earlier training.
 
     Args:
         path: Work folder of the run, or a ``scalars.json``.
@@ -126,16 +129,27 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
         )
     train: dict[float, dict[str, float]] = {}
     val: dict[float, dict[str, float]] = {}
+    num_replaced = 0
     for file in files:  # one for each start of the run, oldest first
-        for record in _records(file):
-            records = train if "loss" in record else val
-            records[record["step"]] = record
+        records = _records(file)
+        first = next((record for record in records if "loss" in record), None)
+        if first is not None and train:
+            start = first["step"]
+            num_replaced += start <= min(train)
+            train = {step: record for step, record in train.items() if step < start}
+            # Validations have the number of their epoch, if the training counts epochs.
+            start = first.get("epoch", start)
+            val = {step: record for step, record in val.items() if step < start}
+        for record in records:
+            of_kind = train if "loss" in record else val
+            of_kind[record["step"]] = record
     if not (train or val):
         raise InputError(f"{files[0]} holds no record of training: give a run's scalars.json.")
     return RunLog(
         name=name or path.resolve().name,
         train=[train[step] for step in sorted(train)],
         val=[val[step] for step in sorted(val)],
+        num_replaced=num_replaced,
     )
 
 

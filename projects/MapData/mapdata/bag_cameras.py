@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmap.utils.errors import InputError
 from mapdata.bag_images import image_size, trouble_with
-from mapdata.folders.rig import RigCamera
+from mapdata.folders.rig import FISHEYE_MODELS, RigCamera
 
 # Words in topics of rectified images, and words that negate the word after them.
 _RECTIFIED = ("rect", "rectified")
@@ -179,13 +179,20 @@ def build_camera(
             f"{image_sizes[0]}: record the camera info of these images, or give --calibration"
         )
     needs_rectification = has_distortion and not rectified
+    model = str(info.distortion_model)
+    if not (rectified or has_distortion) and model in FISHEYE_MODELS:
+        notes.append(
+            f"{where} has the distortion model {model!r} with coefficients that are all zero: its "
+            "images are taken as rectified, as ROS does; give --calibration for an ideal fisheye "
+            "lens"
+        )
     camera = RigCamera(
         name=name,
         intrinsics=matrix,
         cam_from_ground=cam_from_ground,
         size_px=size_px,
         distortion=distortion if needs_rectification else np.zeros(0),
-        model=str(info.distortion_model),
+        model=model if needs_rectification else "",
     )
     return camera, notes
 

@@ -124,7 +124,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     content.digest.update(repr(sorted(topics.items())).encode())
     # If a model was trained on cameras of these names, distorted images are rectified to the
     # cameras of the model. The key describes these cameras.
-    rectification_key = set_rectification_targets(list(rig.values()), options.trained)
+    rectification_key, target_notes = set_rectification_targets(list(rig.values()), options.trained)
     content.digest.update(rectification_key)
 
     times_ns = {}  # distinct times of the images, ascending, by camera
@@ -142,7 +142,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     # Frames without a pose are left out, unless the bag has no poses at all.
     samples = rig_samples(path.stem, list(rig.values()), frames=frames, pose_at=pose_at)
 
-    notes += content.notes() + content.tree.notes + pose_notes
+    notes += content.notes() + content.tree.notes + target_notes + pose_notes
     notes += _usage_notes(
         len(samples),
         requested_count,

@@ -3,7 +3,8 @@
 import hashlib
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -61,9 +62,16 @@ _COPIES = (
     "%d of %d records have elements that are copies of others (the first is %r), as some maps "
     "store the line between two lanes with each of them: give each element once, or join=True."
 )
+# Placeholders: number of records with such rings, number of records, first token.
+_CUT_RINGS = (
+    "%d of %d records have rings of your own classes that leave the range (the first is %r). They "
+    "are cut as areas, so that the border of the range becomes a part of them: give a ring that is "
+    "a line in two open parts."
+)
 _COPY_M = 0.01  # largest distance of two copies of a line
 _SAME_PLACE_M = 0.1  # ends of lines within this distance are one place
 _GLOBAL = "global_instances"
+_POSE = "global_from_frame"
 _KEYS = [*(field.name for field in fields(MapSample)), _GLOBAL]
 _CAMERA_KEYS = [*(field.name for field in fields(CameraRecord)), "distortion", "distortion_model"]
 _LIDAR_KEYS = [field.name for field in fields(LidarRecord)]
@@ -99,7 +107,9 @@ def from_records(
       ``path``, ``timestamp_ns``, ``frame_from_lidar``;
     - ``ego_from_frame`` (4, 4): pose of the frame ``lidar`` in the frame of the vehicle, in which
       the road is at z = 0. Without it, a warning describes the consequences;
-    - ``scene``, ``map_name``, ``timestamp_ns``, ``global_from_frame``, ``can_bus``.
+    - ``scene``, ``map_name``, ``timestamp_ns``, ``can_bus``;
+    - ``global_from_frame`` (4, 4): pose of the frame, for all records or for none. Without it, a
+      model has no memory of earlier frames, and there are no maps of drives.
 
     Args:
         path: Annotation file to write.
@@ -141,6 +151,13 @@ def from_records(
         )
     elif shard.count:
         records = shard.part(list(records))
+    # The metadata, which says whether poses are known, is written before the samples. So the first
+    # record decides, and `create_samples` refuses others that differ.
+    records = iter(records)
+    first = list(islice(records, 1))
+    if any(isinstance(record, Mapping) and record.get(_POSE) is None for record in first):
+        meta = replace(meta, options={**meta.options, "poses": False})
+    records = chain(first, records)
     # A generator: samples are checked and written one by one.
     samples = create_samples(records, meta, root=Path(data_root), join=join)
     return write_annotations(path, meta, samples, shard=shard, source=source)
@@ -162,38 +179,65 @@ def create_samples(
         ValueError: If a record is malformed.
     """
     has_warned = False
-    empty_tokens = []
-    open_tokens = []
-    copied_tokens = []
+    tokens_of: dict[str, list[str]] = {}  # tokens of the records that a warning is about
     count = 0
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
         with explain_errors(f"record {name!r}", "correct it"):
             _require_keys(record, known=_KEYS)
+            if (record.get(_POSE) is not None) != meta.has_poses:
+                text = "has no" if meta.has_poses else "has a"
+                raise InputError(f"it {text} {_POSE}, unlike the first: give all a pose, or none.")
             sample = _create_sample(record, meta=meta, root=root)
             check_samples([sample], meta)  # raises an error for a wrong shape or value
             count += 1
-            had_elements = bool(sample.instances)
             if sample.instances is not None:
-                sample.instances = _clip_elements(sample.instances, meta=meta, join=join)
-            if any(_is_open_area(element, meta) for element in sample.instances or []):
-                open_tokens.append(sample.token)
-            if _has_copies(sample.instances or []):
-                copied_tokens.append(sample.token)
-        if had_elements and not sample.instances:
-            empty_tokens.append(sample.token)
+                whole = join_lines(sample.instances) if join else sample.instances
+                sample.instances = _clip_elements(whole, meta=meta)
+                for warning in _doubts(whole, clipped=sample.instances, meta=meta):
+                    tokens_of.setdefault(warning, []).append(sample.token)
         if sample.ego_from_frame is None and meta.frame == "lidar" and not has_warned:
             has_warned = True
             _, _, road_z_m = frame_view(meta.frame, meta.ground_z_m).ground  # z = a x + b y + c
             height_m = -road_z_m
             _LOGGER.warning(_UNMOUNTED, sample.token, height_m)
         yield sample
-    if empty_tokens:
-        _LOGGER.warning(_ALL_ELEMENTS_LOST, len(empty_tokens), count, empty_tokens[0])
-    if open_tokens:
-        _LOGGER.warning(_OPEN_AREAS, len(open_tokens), count, open_tokens[0])
-    if copied_tokens:
-        _LOGGER.warning(_COPIES, len(copied_tokens), count, copied_tokens[0])
+    for warning, tokens in tokens_of.items():
+        _LOGGER.warning(warning, len(tokens), count, tokens[0])
+
+
+def _doubts(
+    whole: Sequence[MapInstance], clipped: Sequence[MapInstance], meta: AnnotationMeta
+) -> Iterator[str]:
+    """Yield the warnings about the elements of a record.
+
+    Args:
+        whole: Elements before they are clipped.
+        clipped: Elements in the range.
+        meta: Classes and range of the data.
+    """
+    if whole and not clipped:
+        yield _ALL_ELEMENTS_LOST
+    if any(_is_open_area(element, meta) for element in clipped):
+        yield _OPEN_AREAS
+    if _has_copies(clipped):
+        yield _COPIES
+    if any(_is_cut_ring(element, meta) for element in whole):
+        yield _CUT_RINGS
+
+
+def _is_cut_ring(element: MapInstance, meta: AnnotationMeta) -> bool:
+    """Whether an element is a ring of a class of the user that is partly in the range."""
+    points = np.asarray(element.points, np.float64)
+    if meta.classes[element.label] in (*AREA_CLASSES, *LINE_CLASSES) or not is_closed(points):
+        return False
+    return not _is_inside(points, meta) and bool(_clip(points, label=element.label, meta=meta))
+
+
+def _is_inside(points: Points, meta: AnnotationMeta) -> bool:
+    """Whether all points (n, dim) are in the range of an annotation file."""
+    low, high = np.array([meta.x_range, meta.y_range]).T
+    return bool(((points[:, :2] >= low) & (points[:, :2] <= high)).all())
 
 
 def _is_open_area(element: MapInstance, meta: AnnotationMeta) -> bool:
@@ -210,12 +254,8 @@ def _has_copies(elements: Sequence[MapInstance]) -> bool:
     return any(len(_without_copies(lines)) < len(lines) for lines in lines_of.values())
 
 
-def _clip_elements(
-    elements: Sequence[MapInstance], meta: AnnotationMeta, join: bool
-) -> list[MapInstance]:
-    """Join lines if ``join`` is True, then clip all elements to the range of an annotation file."""
-    if join:
-        elements = join_lines(elements)
+def _clip_elements(elements: Sequence[MapInstance], meta: AnnotationMeta) -> list[MapInstance]:
+    """Clip elements to the range of an annotation file."""
     pieces = []
     for element in elements:
         points = np.asarray(element.points, np.float64)
@@ -407,32 +447,35 @@ def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraR
         where = f"sample {token!r}, {name}"
         path = path_below(root, name=camera["path"], noun=f"{where}: the path")
         values["width"], values["height"] = image_size(path, where)
-    if np.any(camera.get("distortion", ())):  # coefficients that are all zero have no effect
-        values["path"] = _rectify_image(values, root=root)
+    distortion = values.pop("distortion", None)
+    model = values.pop("distortion_model", None)
+    if distortion is not None or model is not None:
+        rig_camera = RigCamera(
+            name=str(camera["name"]),
+            intrinsics=np.array(camera["intrinsics"], dtype=np.float64),
+            cam_from_ground=np.eye(4),  # the mounting does not matter for rectification
+            size_px=(int(values["width"]), int(values["height"])),
+            distortion=np.array(() if distortion is None else distortion, dtype=np.float64),
+            model=str(model or ""),
+        )
+        if rig_camera.is_distorted:
+            values["path"] = _rectify_image(rig_camera, camera["path"], root=root)
     return _create_record(CameraRecord, values)
 
 
-def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
+def _rectify_image(rig_camera: RigCamera, image_path: str, root: Path) -> str:
     """Write a camera's image without its distortion, and return its path below the data root."""
-    rig_camera = RigCamera(
-        name=str(camera["name"]),
-        intrinsics=np.array(camera["intrinsics"], dtype=np.float64),
-        cam_from_ground=np.eye(4),  # the mounting does not matter for rectification
-        size_px=(int(camera["width"]), int(camera["height"])),
-        distortion=np.array(camera["distortion"], dtype=np.float64),
-        model=str(camera.get("distortion_model", "")),
-    )
     calibration = (
         rig_camera.intrinsics.tolist(),
         rig_camera.distortion.tolist(),
         rig_camera.model,
     )
     where = f"camera {rig_camera.name!r}"
-    source = path_below(root, name=camera["path"], noun=f"{where}: the path")
+    source = path_below(root, name=image_path, noun=f"{where}: the path")
     # The digest keeps images apart that have another calibration, or whose source was replaced.
     content = digest(source) if source.is_file() else ""  # a missing one raises an error below
     version = hashlib.sha256(f"{calibration} {content}".encode()).hexdigest()[:12]
-    name = f"{file_name(camera['path'])}-{version}.jpg"
+    name = f"{file_name(image_path)}-{version}.jpg"
     path = f"rectified/{file_name(rig_camera.name)}/{name}"
     target = root / path
     if not target.is_file():
@@ -457,8 +500,7 @@ def _clip(points: Points, label: int, meta: AnnotationMeta) -> list[Points]:
     Rings stay rings, such as areas of the user's classes. Rings of lines that leave the range are
     cut into open lines, so that the border of the range is not part of the ground truth.
     """
-    low, high = np.array([meta.x_range, meta.y_range]).T
-    if ((points[:, :2] >= low) & (points[:, :2] <= high)).all():
+    if _is_inside(points, meta):
         return [points]
     if meta.classes[label] in LINE_CLASSES or not is_closed(points):
         return list(clip_to_box(points, x_range=meta.x_range, y_range=meta.y_range))
@@ -467,7 +509,8 @@ def _clip(points: Points, label: int, meta: AnnotationMeta) -> list[Points]:
         raise InputError(
             "a ring crosses itself, so it cannot be cut at the border of the range: correct it."
         )
-    box = shapely.box(xmin=low[0], ymin=low[1], xmax=high[0], ymax=high[1])
+    (x_min, x_max), (y_min, y_max) = meta.x_range, meta.y_range
+    box = shapely.box(xmin=x_min, ymin=y_min, xmax=x_max, ymax=y_max)
     parts = shapely.get_parts(shapely.intersection(polygon, box))
     # The ring may touch the box in points or lines, which are left out. The cut adds no holes.
     is_area = (shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)

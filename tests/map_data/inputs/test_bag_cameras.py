@@ -100,6 +100,17 @@ def test_the_other_matrix_stands_for_an_empty_one_and_it_is_said(topic, changed,
     assert "/front/camera_info" in note
 
 
+def test_a_fisheye_of_zeros_is_taken_as_rectified_and_it_is_said():
+    """As image_geometry does."""
+    camera, (note,) = made((320, 180), distortion_model="equidistant", d=np.zeros(4))
+    assert not camera.is_distorted
+    assert "coefficients that are all zero: its images are taken as rectified" in note
+    _, notes = made((320, 180), "/front/image_rect", distortion_model="equidistant", d=np.zeros(4))
+    assert notes == []
+    _, notes = made((320, 180), distortion_model="plumb_bob", d=np.zeros(5))
+    assert notes == []
+
+
 @pytest.mark.parametrize(
     ("topic", "changed", "message"),
     [

@@ -212,6 +212,7 @@ LEVEL = {"intrinsics": [100, 100, 80, 45], "position_m": [0, 0, 1], "yaw_pitch_r
         ({"focal": 3}, r"camera 'front' cannot be used: unknown keys \['focal'\]"),
         ({"intrinsics": [1, 2]}, r"intrinsics must be \[fx, fy, cx, cy\] or 3 x 3, got \(2,\)"),
         ({"quaternion_wxyz": [1, 0, 0, 0]}, "say its place by"),
+        ({"vehicle_from_camera": np.eye(4).tolist()}, "say its place by"),
         ({"images": "nowhere"}, "camera 'front' has no image at"),
         ({"images": "../secret"}, "must lie below"),
         ({"distortion": [1, 2], "distortion_model": "magic"}, "distortion model 'magic'"),
@@ -245,6 +246,19 @@ def test_a_mirrored_mounting_is_named(tmp_path):
     camera = {"intrinsics": [100, 100, 80, 45], "vehicle_from_camera": mirror}
     (tmp_path / "calibration.yaml").write_text(yaml.safe_dump({"cameras": {"front": camera}}))
     with pytest.raises(ValueError, match=r"'front'.* mirrors .*two axes are swapped"):
+        open_input(tmp_path)
+
+
+def test_a_position_beside_a_whole_pose_is_refused(tmp_path):
+    (tmp_path / "front").mkdir()
+    cv2.imwrite(str(tmp_path / "front/a.png"), np.zeros((90, 160, 3), np.uint8))
+    pose = [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.2], [0, 0, 0, 1]]
+    camera = {"intrinsics": [100, 100, 80, 45], "vehicle_from_camera": pose}
+    path = tmp_path / "calibration.yaml"
+    path.write_text(yaml.safe_dump({"cameras": {"front": camera}}))
+    open_input(tmp_path)
+    path.write_text(yaml.safe_dump({"cameras": {"front": camera | {"position_m": [1.7, 0, 0]}}}))
+    with pytest.raises(ValueError, match="contains the position: leave position_m out"):
         open_input(tmp_path)
 
 

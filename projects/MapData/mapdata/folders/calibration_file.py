@@ -282,6 +282,8 @@ def _vehicle_from_camera(camera: Mapping[str, Any]) -> np.ndarray:
             f"quaternion_wxyz or yaw_pitch_roll_deg; got {sorted(rotation_keys) or 'none of them'}"
         )
     if "vehicle_from_camera" in camera:
+        if "position_m" in camera:
+            raise InputError("vehicle_from_camera contains the position: leave position_m out")
         pose = np.array(camera["vehicle_from_camera"], dtype=np.float64)
         # `is_rigid` also refuses a mirroring matrix. The first test gives it a message of its kind.
         if pose.shape == (4, 4) and np.linalg.det(pose[:3, :3]) < 0:

@@ -96,7 +96,8 @@ def read_image_folder(
             notes += pose_notes
             notes += motion_notes(frames, pose_at=pose_at)
         # The folder of the rectified images is named by a digest, which depends on this key.
-        target_key = set_rectification_targets(rig, trained or {})
+        target_key, target_notes = set_rectification_targets(rig, trained or {})
+        notes += target_notes
         scene = folder.resolve().name
         samples = rig_samples(scene, rig, frames=frames, pose_at=pose_at)
         root = folder  # folder of the image paths

@@ -36,7 +36,7 @@ PLAIN_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "")
 _COUNTS = dict.fromkeys(PLAIN_MODELS, (4, 5, 8, 12, 14)) | dict.fromkeys(FISHEYE_MODELS, (4,))
 _LEAST_SHARE = 0.1  # smallest share of a rectified image that the original image covers
 _SAME_TIME_NS = 1_000_000  # the motion in a shorter time is negligible
-_GRID = 16  # width and height in pixels of the small image on which this share is measured
+_GRID = 64  # width and height in pixels of the small image on which this share is measured
 
 
 @dataclass
@@ -52,7 +52,7 @@ class RigCamera:
         distortion: Distortion coefficients in OpenCV's order; empty for a pinhole camera. (n,)
         model: Distortion model, as ROS names it.
         trained: Width, height, fx, fy, cx and cy of the camera that a model was trained on. Images
-            of a distorted camera are rectified to these intrinsics, scaled to the size of the
+            of a distorted camera are rectified to these intrinsics, scaled to the width of the
             images. None rectifies them to ``intrinsics``.
 
     Raises:
@@ -75,16 +75,20 @@ class RigCamera:
         if self.trained is None or not self.is_distorted:
             return self.intrinsics
         width, height, fx, fy, cx, cy = self.trained
-        scale_x = self.size_px[0] / width
-        scale_y = self.size_px[1] / height
-        return np.array(
-            [[fx * scale_x, 0, cx * scale_x], [0, fy * scale_y, cy * scale_y], [0, 0, 1.0]]
-        )
+        scale = self.size_px[0] / width  # one for both axes: another ratio would squeeze the image
+        # The distance of the principal point from the centre of the image is scaled.
+        centre_y = self.size_px[1] / 2 + (cy - height / 2) * scale
+        return np.array([[fx * scale, 0, cx * scale], [0, fy * scale, centre_y], [0, 0, 1.0]])
 
     def __post_init__(self) -> None:
         if min(self.size_px) < 1:
             raise InputError(f"camera {self.name!r} has images of {self.size_px} pixels, not > 0.")
-        if self.is_distorted:
+        if self.model in FISHEYE_MODELS and self.distortion.size == 0:
+            raise InputError(
+                f"camera {self.name!r} has the distortion model {self.model!r}, but no distortion: "
+                "give its four coefficients, which are zeros for an ideal fisheye lens."
+            )
+        if self.distortion.size > 0:
             self._check_distortion()
 
     def _check_distortion(self) -> None:
@@ -106,7 +110,7 @@ class RigCamera:
                 f"{self.model or 'plumb_bob'} takes {' or '.join(map(str, counts))} numbers, all "
                 "finite."
             )
-        if not self._covered_share() > _LEAST_SHARE:
+        if not self.covered_share() > _LEAST_SHARE:
             raise InputError(
                 f"{where} sees next to nothing without its distortion {numbers.tolist()!r:.80}: "
                 "intrinsics must be in pixels of these images, and the distortion of the model "
@@ -115,16 +119,21 @@ class RigCamera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether images must be rectified before they are given to a model."""
-        return bool(np.any(self.distortion))
+        """Whether images must be rectified before they are given to a model.
 
-    def _covered_share(self) -> float:
+        Coefficients of a fisheye lens that are all zero are an ideal one, r = f theta, which is no
+        pinhole camera. Those of the other models stand for a camera without distortion.
+        """
+        is_fisheye = self.model in FISHEYE_MODELS and self.distortion.size > 0
+        return is_fisheye or bool(np.any(self.distortion))
+
+    def covered_share(self) -> float:
         """Approximate share of a rectified image that the original image covers, in [0, 1]."""
         # Both modules have a function of this name, each for its distortion models.
         lens = cv2.fisheye if self.model in FISHEYE_MODELS else cv2
         width, height = self.size_px
         # The pinhole matrix of the image, scaled down to the small image.
-        small_intrinsics = np.diag([_GRID / width, _GRID / height, 1.0]) @ self.intrinsics
+        small_intrinsics = np.diag([_GRID / width, _GRID / height, 1.0]) @ self.rectified_intrinsics
         # x and y are the position of each pixel of a small rectified image in the original image.
         x, y = lens.initUndistortRectifyMap(
             self.intrinsics,
@@ -160,7 +169,7 @@ class RigCamera:
 
 def set_rectification_targets(
     rig: Sequence[RigCamera], trained: Mapping[str, Sequence[float]]
-) -> bytes:
+) -> tuple[bytes, list[str]]:
     """Set the cameras of a model as the targets of rectification, by name.
 
     Args:
@@ -168,15 +177,32 @@ def set_rectification_targets(
         trained: Width, height, fx, fy, cx and cy of the model's cameras, by name.
 
     Returns:
-        Names and intrinsics of the cameras with a target, as bytes. Callers add them to the digest
-        that names the rectified images. Empty if no camera has a target.
+        Names and intrinsics of the cameras with a target, as bytes, and notes. Callers add the
+        bytes to the digest that names the rectified images. They are empty if no camera has a
+        target.
     """
     text = ""  # a line for each camera with a target
+    notes = []
     for camera in rig:
-        if camera.is_distorted and camera.name in trained:
-            camera.trained = tuple(trained[camera.name])
-            text += f"{camera.name} {camera.trained}\n"
-    return text.encode()
+        if not camera.is_distorted or camera.name not in trained:
+            continue
+        camera.trained = tuple(trained[camera.name])
+        share = camera.covered_share()
+        focal_px = camera.rectified_intrinsics[0, 0]
+        if share > _LEAST_SHARE:
+            text += f"{camera.name} {camera.rectified_intrinsics.tolist()}\n"
+            notes.append(
+                f"camera {camera.name!r} is rectified to the focal length of the model, "
+                f"{focal_px:.0f} in place of {camera.intrinsics[0, 0]:.0f} pixels; "
+                f"{share:.0%} of its images are covered"
+            )
+        else:
+            camera.trained = None
+            notes.append(
+                f"camera {camera.name!r} keeps its focal length: with that of the model only "
+                f"{share:.0%} of its images would be covered"
+            )
+    return text.encode(), notes
 
 
 def rotation_of(wxyz: Iterable[Any]) -> np.ndarray:
