@@ -263,6 +263,11 @@ def test_wrong_images_and_matrices_are_named(shipped):
         with pytest.raises(ValueError, match=f"0 to 255, the image of CAM_FRONT has {values}: con"):
             exported([wrong, *images[1:]], {"lidar2img": matrices})
     calibration = {"lidar2img": matrices, "can_bus": np.zeros(18)}
+    shares = [np.full((rows, columns, 3), level, np.float32) for level in (0.5, 1, 0, 0, 0.2, 0)]
+    with pytest.raises(ValueError, match="have values up to 1: multiply them by 255"):
+        exported.prepare(shares, calibration)
+    exported.prepare([np.zeros_like(shares[0])] * 6, calibration)  # black images
+    exported.prepare([*shares[:5], shares[0] * 200], calibration)
     white = np.full((900, 1600, 3), 255, np.float32)
     largest = cv2.resize(white, (704, 256), interpolation=cv2.INTER_AREA).max()
     assert largest > 255  # by rounding

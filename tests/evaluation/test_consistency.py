@@ -233,6 +233,7 @@ def test_a_track_twice_in_a_sample_is_named(files, tmp_path):
     twice.append({**twice[0], "cls_name": "boundary", "type": 2})  # MapTracker's are of a class
     (tmp_path / "twice.json").write_text(json.dumps(content))
     drive_frames(tmp_path / "twice.json", annotations, CONFIG.classes)
+    drive_frames(tmp_path / "twice.json", annotations, ("ped_crossing",))  # others are not scored
     twice.append(twice[0])
     (tmp_path / "twice.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"sample '1': two elements of a class have track_id 4"):

@@ -220,6 +220,15 @@ def test_a_map_in_pieces_is_joined_on_request(tmp_path: Path, caplog: pytest.Log
     np.testing.assert_array_equal(crossing, ring)
 
 
+def test_lines_through_the_same_corners_in_another_order_are_no_copies(tmp_path: Path, caplog):
+    corners = np.array([[0, 0], [0, 5], [8, 5], [8, 0.0]])
+    pieces = [{"label": 2, "points": corners}, {"label": 2, "points": corners[[1, 0, 3, 2]]}]
+    from_records(tmp_path / "j.arrow", [record(instances=pieces)], META, tmp_path)
+    assert "copies" not in caplog.text
+    from_records(tmp_path / "j.arrow", [record(instances=pieces)], META, tmp_path, join=True)
+    assert len(AnnotationFile(tmp_path / "j.arrow")[0].instances) == 2
+
+
 def test_a_line_of_two_lanes_is_one_line(tmp_path: Path):
     line = np.array([[0, 0], [10, 0], [20, 1.0]])
     onward = np.array([[20, 1], [25, 1], [28, 2.0]])

@@ -187,6 +187,18 @@ def test_shapes_that_disagree_are_named():
         raster_loss(torch.zeros(2, 4, 5), torch.zeros(1, 4, 5))
 
 
-def test_an_unknown_reduction_is_named():
-    with pytest.raises(ValueError, match=r"normalize must be one of .*got 'mean'"):
-        raster_loss(torch.zeros(1, 4, 5), torch.zeros(1, 4, 5), normalize="mean")
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"normalize": "mean"}, r"normalize must be one of .*got 'mean'"),
+        ({"window_size": 10}, "window_size must be odd and >= 1, got 10"),
+        ({"window_size": 0}, "window_size must be odd and >= 1, got 0"),
+        ({"window_sigma": 0.0}, "window_sigma must be > 0 and finite, got 0.0"),
+        ({"alpha": float("nan")}, r"alpha must lie in \[0, 1\], got nan"),
+        ({"foreground_weight": float("inf")}, "foreground_weight must be > 0 and finite"),
+    ],
+)
+def test_a_setting_outside_its_range_is_named(settings, text, backend):
+    with pytest.raises(ValueError, match=text):
+        raster_loss(torch.zeros(1, 4, 5), torch.zeros(1, 4, 5), **settings, backend=backend)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from gsmap.ops.soft_iou import dice_loss, pairwise_dice_loss, pairwise_soft_iou
+from gsmap.ops.soft_iou import dice_loss, pairwise_dice_loss, pairwise_soft_iou, soft_iou
 
 BACKENDS = ["reference", "cpu"]
 
@@ -43,6 +43,22 @@ def test_dice_loss_by_hand():
     # the other pairs: 1 - 1 / (1.5 + 1) and 1 - 1 / (2 + 1)
     expected = torch.tensor([[4 / 9, 0.6], [2 / 3, 0.0]])
     torch.testing.assert_close(pairwise_dice_loss(preds, targets), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_large_masks_in_half_precision_are_summed_in_float32(dtype):
+    """The sums of 90,000 ones, and products of them, are beyond float16."""
+    ones = torch.ones(2, 300, 300, dtype=dtype)
+    for loss in (dice_loss(ones, ones), pairwise_dice_loss(ones, ones)):
+        assert loss.dtype == torch.float32
+        assert loss.abs().max() < 1e-6
+    torch.testing.assert_close(soft_iou(ones, ones), torch.ones(2))
+    preds, targets = sparse_masks(5, 0).to(dtype), sparse_masks(5, 1).to(dtype)
+    pairs = pairwise_soft_iou(preds, targets)
+    torch.testing.assert_close(soft_iou(preds, targets), pairs.diagonal())
+    with torch.autocast("cpu", torch.bfloat16):
+        pairs = pairwise_dice_loss(preds.float(), targets.float())
+    torch.testing.assert_close(dice_loss(preds, targets), pairs.diagonal())
 
 
 def test_two_empty_masks_have_no_overlap():

@@ -309,7 +309,8 @@ def _without_copies(lines: Sequence[Points]) -> list[Points]:
     for index, shape in enumerate(shapes):
         # Copies have nearly equal bounding boxes, which are fast to compare.
         is_near = (np.abs(bounds - bounds[index]) <= _COPY_M).all(axis=1) & is_kept
-        distances = shapely.hausdorff_distance(shapes[is_near], shape)
+        # Points between the vertices count, too: lines may join the same vertices in another order.
+        distances = shapely.hausdorff_distance(shapes[is_near], shape, densify=0.25)
         is_kept[index] = not (distances <= _COPY_M).any()
     return [lines[index] for index in np.flatnonzero(is_kept)]
 

@@ -334,6 +334,7 @@ class OnnxInferencer:
                 f"got {len(images)} images: give one of each, or export for other cameras."
             )
         rows, columns = self.image_size
+        brightest = 0.0  # of the images in floating point
         for camera, image in zip(self.cameras, images, strict=True):
             if np.shape(image) != (rows, columns, 3):
                 raise InputError(
@@ -343,15 +344,22 @@ class OnnxInferencer:
                 )
             values = np.asarray(image)
             if values.dtype == np.uint8:  # all values are valid
+                brightest = 255.0
                 continue
             low = values.min()
             high = values.max()
+            brightest = max(brightest, float(high))
             is_finite = np.isfinite(low) and np.isfinite(high)  # if not, `prepare` raises an error
             if is_finite and (low < -_ROUNDING or high > 255 + _ROUNDING):
                 raise InputError(
                     f"{self.path.name} takes images with values from 0 to 255, the image of "
                     f"{camera} has {low} to {high}: convert it to 8 bits."
                 )
+        if 0 < brightest <= 1:  # images in the range of torchvision, which look black here
+            raise InputError(
+                f"{self.path.name} takes images with values from 0 to 255, the images have values "
+                "up to 1: multiply them by 255."
+            )
 
     def run(self, inputs: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[Any]]:
         """Run the graph.

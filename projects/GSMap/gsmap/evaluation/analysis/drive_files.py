@@ -129,8 +129,9 @@ def _check_tracks(ids: IntArray, elements: MapElements, results: Path, token: st
     """Raise ValueError if two elements of a class have equal tracks."""
     # The columns of `pairs` are the distinct pairs (label, track).
     pairs, counts = np.unique([elements.labels, ids], axis=1, return_counts=True)
-    tracks = pairs[1]
-    repeated_tracks = tracks[(counts > 1) & (tracks >= 0)]  # -1 is no track, and may repeat
+    labels, tracks = pairs
+    # -1 is no track, and may repeat. Elements of all classes that are not scored have the label -1.
+    repeated_tracks = tracks[(counts > 1) & (tracks >= 0) & (labels >= 0)]
     if len(repeated_tracks):
         track = repeated_tracks[0]
         raise InputError(

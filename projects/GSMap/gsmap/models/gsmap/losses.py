@@ -10,7 +10,7 @@ from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
 from gsmap.models.base.parts import WeightConfig, check_weight, class_weights
 from gsmap.models.gsmap.reference import require_gaussians
-from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
+from gsmap.ops.raster_loss import check_raster_settings, raster_loss
 from gsmap.ops.soft_iou import dice_loss, soft_iou
 from gsmap.utils.errors import InputError
 
@@ -95,16 +95,6 @@ class RasterLoss(MaskLoss):
         **flags: bool,
     ) -> None:
         super().__init__(loss_weight=loss_weight, full_iou=full_iou, **flags)
-        if not 0 <= alpha <= 1:
-            raise InputError(f"alpha must lie in [0, 1], got {alpha}.")
-        if foreground_weight <= 0:
-            raise InputError(f"foreground_weight must be > 0, got {foreground_weight}.")
-        if normalize not in NORMALIZATIONS:
-            raise InputError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
-        if window_size < 1 or window_size % 2 == 0:
-            raise InputError(f"window_size must be odd and >= 1, got {window_size}.")
-        if window_sigma <= 0:
-            raise InputError(f"window_sigma must be > 0, got {window_sigma}.")
         self.settings: dict[str, Any] = {
             "alpha": alpha,
             "foreground_weight": foreground_weight,
@@ -112,6 +102,7 @@ class RasterLoss(MaskLoss):
             "window_size": window_size,
             "window_sigma": window_sigma,
         }
+        check_raster_settings(**self.settings)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
         """Raster loss of each pair. (M,)"""

@@ -26,6 +26,37 @@ _raster_loss_sums = fused_operator(
 )
 
 
+def check_raster_settings(
+    alpha: float,
+    foreground_weight: float,
+    normalize: str,
+    window_size: int,
+    window_sigma: float,
+) -> None:
+    """Check the settings of the raster loss.
+
+    Args:
+        alpha: Share of the L1 term, in [0, 1].
+        foreground_weight: Weight of a foreground pixel, > 0.
+        normalize: Divisor of the sums over pixels.
+        window_size: Side of SSIM's window in pixels, odd.
+        window_sigma: Standard deviation of SSIM's window in pixels, > 0.
+
+    Raises:
+        ValueError: If a setting is outside its range.
+    """
+    if not 0 <= alpha <= 1:
+        raise InputError(f"alpha must lie in [0, 1], got {alpha}.")
+    if not 0 < foreground_weight < math.inf:
+        raise InputError(f"foreground_weight must be > 0 and finite, got {foreground_weight}.")
+    if normalize not in NORMALIZATIONS:
+        raise InputError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
+    if window_size < 1 or window_size % 2 == 0:
+        raise InputError(f"window_size must be odd and >= 1, got {window_size}.")
+    if not 0 < window_sigma < math.inf:
+        raise InputError(f"window_sigma must be > 0 and finite, got {window_sigma}.")
+
+
 def raster_loss(
     preds: Tensor,
     targets: Tensor,
@@ -60,26 +91,25 @@ def raster_loss(
         preds: Rendered masks in [0, 1]. (n, H, W)
         targets: Ground-truth masks in [0, 1]. (n, H, W)
         alpha: Share of the L1 term, in [0, 1].
-        foreground_weight: Weight of a foreground pixel, relative to a background pixel.
+        foreground_weight: Weight of a foreground pixel, relative to a background pixel, > 0.
         normalize: ``"both"``, ``"foreground"`` or ``"pixels"``.
         window_size: Side of SSIM's window in pixels, odd.
-        window_sigma: Standard deviation of SSIM's window in pixels.
+        window_sigma: Standard deviation of SSIM's window in pixels, > 0.
         backend: Backend, see `choose_backend`.
 
     Returns:
         Loss of each mask, differentiable in ``preds``. (n,)
 
     Raises:
-        ValueError: If the shapes disagree, ``normalize`` is unknown, or ``backend`` is unknown or
-            does not support the inputs.
+        ValueError: If the shapes disagree, a setting is outside its range, or ``backend`` is
+            unknown or does not support the inputs.
     """
     if preds.ndim != 3 or preds.shape != targets.shape:
         raise InputError(
             "preds and targets must both have shape (n, H, W), "
             f"got {tuple(preds.shape)} and {tuple(targets.shape)}."
         )
-    if normalize not in NORMALIZATIONS:
-        raise InputError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
+    check_raster_settings(alpha, foreground_weight, normalize, window_size, window_sigma)
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds = preds.to(dtype)
     targets = targets.detach().to(dtype)

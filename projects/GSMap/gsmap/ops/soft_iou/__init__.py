@@ -43,9 +43,9 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
             "preds and targets must have shapes (N, H, W) and (K, H, W), "
             f"got {tuple(preds.shape)} and {tuple(targets.shape)}."
         )
-    dtype = torch.promote_types(preds.dtype, torch.float32)  # half precision becomes float32
-    preds = preds.to(dtype).flatten(1)  # (N, HW)
-    targets = targets.to(dtype).flatten(1)  # (K, HW)
+    preds, targets = _in_one_type(preds, targets)
+    preds = preds.flatten(1)  # (N, HW)
+    targets = targets.flatten(1)  # (K, HW)
     wants_gradient = torch.is_grad_enabled() and (preds.requires_grad or targets.requires_grad)
     if backend == "auto" and wants_gradient:
         backend = "reference"
@@ -69,8 +69,18 @@ def soft_iou(preds: Tensor, targets: Tensor) -> Tensor:
     Returns:
         Soft IoU in [0, 1]. (M,)
     """
+    preds, targets = _in_one_type(preds, targets)
     minima = torch.minimum(preds, targets).sum((1, 2))
     return _iou(minima, preds.sum((1, 2)), target_sums=targets.sum((1, 2)))
+
+
+def _in_one_type(preds: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """Convert masks to the type of the predictions, at least float32.
+
+    Sums over the pixels of a mask are too large for half precision.
+    """
+    dtype = torch.promote_types(preds.dtype, torch.float32)
+    return preds.to(dtype), targets.to(dtype)
 
 
 def _iou(minima: Tensor, pred_sums: Tensor, target_sums: Tensor) -> Tensor:
@@ -89,6 +99,7 @@ def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
     Returns:
         Losses in [0, 1]. (n,)
     """
+    preds, targets = _in_one_type(preds, targets)
     overlap = (preds * targets).sum((1, 2))
     sizes = preds.sum((1, 2)) + targets.sum((1, 2))
     return 1 - (2 * overlap + 1) / (sizes + 1)
@@ -104,8 +115,10 @@ def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
     Returns:
         Losses in [0, 1]. (N, K)
     """
+    preds, targets = _in_one_type(preds, targets)
     preds = preds.flatten(1)
     targets = targets.flatten(1)
-    overlap = preds @ targets.T
+    with torch.autocast(preds.device.type, enabled=False):
+        overlap = preds @ targets.T
     sizes = preds.sum(-1)[:, None] + targets.sum(-1)
     return 1 - (2 * overlap + 1) / (sizes + 1)
