@@ -205,3 +205,9 @@ def test_layers_of_the_decoder_are_guided_by_a_part_and_stay():
     assert add_guidance({"type": MGMapNetDecoder, "layer": {"guidance": None}})["layer"] == {
         "guidance": None
     }
+
+
+def test_a_layer_class_of_another_decoder_is_refused():
+    decoder = {"type": MGMapNetDecoder, "layer": {"type": "GaussianDecoderLayer"}}
+    with pytest.raises(ValueError, match=r"MGMapNetDecoder.* are of a class of its own.*type out"):
+        add_guidance(decoder)

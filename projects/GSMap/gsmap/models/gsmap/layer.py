@@ -7,6 +7,7 @@ from mmdet3d.registry import MODELS
 from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.base.parts import PartConfig, class_of, with_defaults
 from gsmap.models.gsmap.guidance import GaussianGuidance
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -53,6 +54,9 @@ def add_guidance(decoder: PartConfig) -> PartConfig:
 
     Returns:
         The copy, in which only ``layer`` is changed.
+
+    Raises:
+        ValueError: If a decoder with layers of its own is given a `GaussianDecoderLayer`.
     """
     layer = decoder.get("layer", {})
     decoder_class = class_of(with_defaults(decoder, type=MapDecoder))
@@ -64,6 +68,12 @@ def add_guidance(decoder: PartConfig) -> PartConfig:
     # `MapDecoderLayer`, its layers keep this class and get the guidance as a part.
     if not has_other_layers and "guidance" not in layer:
         return {**decoder, "layer": with_defaults(layer, type=GaussianDecoderLayer)}
+    layer_class = class_of(layer)
+    if has_other_layers and layer_class and issubclass(layer_class, GaussianDecoderLayer):
+        raise InputError(
+            f"the layers of {decoder['type']} are of a class of its own, and are conditioned on "
+            f"Gaussians without {layer_class.__name__}: leave decoder.layer.type out."
+        )
     guidance = layer.get("guidance", {})
     if guidance is not None:  # None switches the guidance off
         guidance = with_defaults(guidance, type=GaussianGuidance)
