@@ -42,16 +42,16 @@ model = dict(
         num_classes=len(map_classes), in_channels=width, sync_cls_avg_factor=True,
         with_box_refine=True, as_two_stage=False, code_size=2, code_weights=[1.0, 1.0, 1.0, 1.0],
         transformer=dict(
-            type='PerceptionTransformer', rotate_prev_bev=True, use_shift=True, use_can_bus=True,
-            embed_dims=width, {cameras}
+            type='{prefix}PerceptionTransformer', rotate_prev_bev=True, use_shift=True,
+            use_can_bus=True, embed_dims=width, {cameras}
             encoder={encoder},
             decoder=dict(
-                type='Decoder', num_layers=6, return_intermediate=True,
+                type='{prefix}Decoder', num_layers=6, return_intermediate=True,
                 transformerlayers=dict(
                     {layer},
                     feedforward_channels=hidden, ffn_dropout={dropout}, operation_order={order}))),
         bbox_coder=dict(
-            type='NMSFreeCoder', post_center_range={limits}, pc_range=range_m, max_num=50,
+            type='{prefix}NMSFreeCoder', post_center_range={limits}, pc_range=range_m, max_num=50,
             voxel_size=[0.15, 0.15, 4], num_classes=len(map_classes)),
         positional_encoding=dict(type='LearnedPositionalEncoding', num_feats=width // 2),
         loss_cls=dict(type='FocalLoss', use_sigmoid=True, gamma=2.0, alpha=0.25, loss_weight=2.0),
@@ -62,7 +62,7 @@ model = dict(
         grid_size=[512, 512, 1], voxel_size=[0.15, 0.15, 4], point_cloud_range=range_m,
         out_size_factor=4,
         assigner=dict(
-            type='Assigner', cls_cost=dict(type='FocalLossCost', weight=2.0),
+            type='{prefix}Assigner', cls_cost=dict(type='FocalLossCost', weight=2.0),
             reg_cost=dict(type='BBoxL1Cost', weight=0.0, box_format='xywh'),
             iou_cost=dict(type='IoUCost', iou_mode='giou', weight=0.0),
             {costs}, pc_range=range_m))))
@@ -136,6 +136,7 @@ SEGMENTATION = (
 )
 COST = "pts_cost=dict(type='OrderedPtsL1Cost', weight={pts})"
 NUSCENES = {
+    "prefix": "MapTR",
     "range_m": "[-15.0, -30.0, -2.0, 15.0, 30.0, 2.0]", "rows": 200, "cols": 100,
     "limits": "[-20, -35, -20, -35, 20, 35, 20, 35]", "root": "data/nuscenes/", "cameras": "",
     "dataset": "CustomNuScenesLocalMapDataset", "scale": 0.5, "batch": 4, "epochs": 24,

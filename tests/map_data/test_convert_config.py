@@ -1,5 +1,6 @@
 """Configs in the form of the original repositories become ours, and what has no place is named."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -8,13 +9,15 @@ import upstream_configs
 from method_cases import cases_of_methods
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
+from mmengine.optim import build_optim_wrapper
 from processes import run_tool
 from upstream_configs import BASE, converted
 
 from gsmap.engine.launch import check_config, read_config
 from mapdata.upstream_configs.fields import Fields
 from mapdata.upstream_configs.reader import read_assignments
-from mapdata.upstream_configs.upstream import python_text
+from mapdata.upstream_configs.upstream import convert_upstream, python_text
+from tools.convert_config import convert
 
 REPO = Path(__file__).resolve().parents[2]
 # our config -> the config of the authors, and the settings that differ
@@ -397,10 +400,284 @@ def test_what_only_blocks_a_kernel_or_switches_heights_off_has_no_effect(tmp_pat
 def with_heights(text: str, heights: bool) -> str:
     """Say in each place where the originals do whether points have heights."""
     of_points = f"z_cfg=dict(pred_z_flag={heights}, gt_z_flag={heights}), "
-    for part in ("type='Assigner', ", "type='NMSFreeCoder', ", "type='PerceptionTransformer', "):
+    for part in ("Assigner', ", "NMSFreeCoder', ", "PerceptionTransformer', "):
         assert part in text
         text = text.replace(part, part + of_points)
     text = text.replace("Head',\n", f"Head', {of_points}\n")
     text = text.replace("type='CustomNuScenes", f"{of_points}type='CustomNuScenes")
     assert text.count("z_cfg") == 5
     return text
+
+
+@pytest.mark.parametrize(
+    ("theirs", "other", "section"),
+    [
+        ("OrderedPtsL1Cost", "OrderedPtsSmoothL1Cost", "train_cfg.pts.assigner.pts_cost"),
+        ("FocalLossCost", "ClassificationCost", "train_cfg.pts.assigner.cls_cost"),
+        ("MapTRAssigner", "MySimOTAAssigner", "train_cfg.pts.assigner"),
+        ("PtsL1Loss", "OrderedPtsSmoothL1Loss", "pts_bbox_head.loss_pts"),
+        ("PtsDirCosLoss", "MyOwnDirectionLoss", "pts_bbox_head.loss_dir"),
+        ("MapTRNMSFreeCoder", "MyRealNMSCoder", "pts_bbox_head.bbox_coder"),
+        ("MapTRNMSFreeCoder", "NMSFreeCoder", "pts_bbox_head.bbox_coder"),  # it decodes 3D boxes
+        ("MapTRPerceptionTransformer", "MyTransformer", "pts_bbox_head.transformer"),
+        ("MapTRDecoder", "MyFancyDecoder", "pts_bbox_head.transformer.decoder"),
+        ("MapTRDecoder", "DetectionTransformerDecoder", "pts_bbox_head.transformer.decoder"),
+    ],
+)
+def test_a_type_with_one_counterpart_is_named_with_any_other(theirs, other, section, tmp_path):
+    text = upstream_configs.maptr()
+    assert text.count(f"type='{theirs}'") == 1
+    text = text.replace(f"type='{theirs}'", f"type='{other}'")
+    _, unplaced = converted(text, tmp_path)
+    assert set(unplaced) == {BASE, f"model.{section}.type = '{other}'"}
+    target = tmp_path / "ours.py"
+    with pytest.raises(ValueError, match=f"another model.*{section}.type = '{other}'"):
+        convert(tmp_path / "theirs.py", target)
+    assert not target.exists()
+    assert f"{section}.type = '{other}'" in convert(
+        tmp_path / "theirs.py", target, allow_changes=True
+    )
+
+
+# Types without an effect: of losses and costs whose weight is zero, and of the order of samples.
+WITHOUT_EFFECT = {"L1Loss", "GIoULoss", "BBoxL1Cost", "IoUCost", "DistributedGroupSampler"}
+
+
+@pytest.mark.parametrize("ours", {**CONFIGS, **HEADS})
+def test_no_type_in_the_configs_of_the_papers_is_dropped_unseen(ours, tmp_path):
+    """Each one becomes another, which the converted config has or a message names."""
+    text = CONFIGS[ours][0] if ours in CONFIGS else HEADS[ours]
+    source = tmp_path / "theirs.py"
+    unseen = set()
+    for kind in set(re.findall(r"type='(\w+)'", text)) - {"l1"}:
+        source.write_text(text.replace(f"type='{kind}'", "type='Another'"))
+        try:
+            conversion = convert_upstream(read_assignments(source))
+            found = f"{conversion.settings} {conversion.unplaced}"
+        except ValueError as error:
+            found = str(error)
+        if "Another" not in found:
+            unseen.add(kind)
+    assert unseen <= WITHOUT_EFFECT
+
+
+OTHER_RANGE = "pc_range=[0.0, 0.0, -2.0, 9.0, 9.0, 2.0]"
+
+
+@pytest.mark.parametrize(
+    ("theirs", "other", "named"),
+    [
+        ("pc_range=range_m, max_num", f"{OTHER_RANGE}, max_num", "bbox_coder.pc_range = [0.0, "),
+        ("pc_range=range_m))))", f"{OTHER_RANGE}))))", "pts.assigner.pc_range = [0.0, "),
+        ("pc_range=range_m, num_points", f"{OTHER_RANGE}, num_points", "encoder.pc_range = [0.0, "),
+        ("4], num_classes=len(map_classes))", "4], num_classes=9)", "bbox_coder.num_classes = 9"),
+        ("return_intermediate=True", "return_intermediate=False", "decoder.return_intermediate"),
+        ("return_intermediate=False", "return_intermediate=True", "encoder.return_intermediate"),
+        ("metric='chamfer'", "metric='iou'", "evaluation.metric = 'iou'"),
+        # without the setting, the original has another default
+        ("query_embed_type='instance_pts',", "", "head.query_embed_type = 'all_pts'"),
+        ("gt_shift_pts_pattern='v2',", "", "head.gt_shift_pts_pattern = 'v0'"),
+        ("with_box_refine=True,", "", "head.with_box_refine = False"),
+    ],
+)
+def test_a_setting_that_changes_the_model_is_named(theirs, other, named, tmp_path):
+    text = upstream_configs.maptr()
+    assert text.count(theirs) == 1
+    _, unplaced = converted(text.replace(theirs, other), tmp_path)
+    assert len(unplaced) == 2
+    assert any(named in line for line in unplaced)
+
+
+@pytest.mark.parametrize(
+    ("theirs", "other", "named"),
+    [
+        ("voxel_size=[0.15, 0.15, 20.0]", "voxel_size=[0.15, 0.15, 4.0]", "encoder.voxel_size"),
+        ("grid_config=depth", "grid_config=dict(depth=[1, 9, 1])", "encoder.grid_config.depth"),
+        ("dict(type='CustomC", "dict(type='CustomPointToMultiViewDepth', downsample=4), {}", "ple"),
+    ],
+)
+def test_a_setting_that_changes_lifting_by_depth_is_named(theirs, other, named, tmp_path):
+    text = upstream_configs.maptr(**upstream_configs.LIFTED)
+    assert text.count(theirs) == 1
+    _, unplaced = converted(text.replace(theirs, other.format(theirs)), tmp_path)
+    assert len(unplaced) == 2
+    assert any(named in line for line in unplaced)
+
+
+SCALE = "    dict(type='RandomScaleImageMultiViewImage', scales=[0.5]),\n"
+NORMALISE = "    dict(type='NormalizeMultiviewImage', **norm),\n"
+PAD = "    dict(type='PadMultiViewImage', size_divisor=32),\n"
+TESTED = "transforms=[train_pipeline[3], train_pipeline[4]]"
+OF_TEST = "transforms=[{}, train_pipeline[4]]"
+PARAMWISE = "paramwise_cfg=dict(custom_keys={'img_backbone': dict(lr_mult=0.1)}),"
+WARM_UP = "warmup='linear', warmup_iters=500, warmup_ratio=1.0 / 3,"
+LINEAR = {"type": "LinearLR", "by_epoch": False, "begin": 0, "end": 500, "start_factor": 1 / 3}
+COSINE = {"type": "CosineAnnealingLR", "by_epoch": True, "eta_min_ratio": 1e-3}
+
+
+def without(*parts: str) -> str:
+    """The config of MapTR without these parts of its text."""
+    text = upstream_configs.maptr()
+    for part in parts:
+        assert part in text
+        text = text.replace(part, "")
+    return text
+
+
+def replaced(theirs: str, other: str) -> str:
+    """The config of MapTR with another part."""
+    text = upstream_configs.maptr()
+    assert theirs in text
+    return text.replace(theirs, other)
+
+
+def no_scale() -> str:
+    """The config of MapTR without a step that scales images."""
+    return without(SCALE).replace(TESTED, "transforms=[train_pipeline[3]]")
+
+
+def scales(cfg: Config) -> list[float | None]:
+    """Scale of the images in training, validation and test; None without a step."""
+    found = []
+    for part in ("train", "val", "test"):
+        steps = {step.type: step for step in cfg[f"{part}_dataloader"].dataset.pipeline}
+        found.append(steps["ScaleImages"].scale if "ScaleImages" in steps else None)
+    return found
+
+
+SCALED = "dict(type='RandomScaleImageMultiViewImage', scales=[{}])"
+VAL_PIPELINE = f"val_pipeline = [{SCALED.format(0.4)}]\ndata_root = 'data"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (no_scale(), [None, None, None]),
+        (replaced(TESTED, OF_TEST.format(SCALED.format(0.8))), [0.5, 0.8, 0.8]),
+        (replaced(TESTED, "transforms=[train_pipeline[4]]"), [0.5, None, None]),
+        (
+            replaced("data_root = 'data", VAL_PIPELINE).replace(
+                "pipeline=test_pipeline, samples", "pipeline=val_pipeline, samples"
+            ),
+            [0.5, 0.4, 0.5],
+        ),
+        (replaced("pipeline=test_pipeline, samples", "samples"), [0.5, 0.5, 0.5]),
+    ],
+)
+def test_each_pipeline_has_the_scale_of_the_file(text, expected, tmp_path):
+    cfg, _ = converted(text, tmp_path)
+    assert scales(cfg) == expected
+
+
+@pytest.mark.parametrize(
+    ("theirs", "other", "named"),
+    [
+        ("scales=[0.5]", "scales=[0.5, 0.7]", ["train.pipeline.3.scales", "val.pipeline.2.transf"]),
+        (TESTED, OF_TEST.format(f"{SCALED.format(0.5)}, {SCALED.format(0.9)}"), ["transforms.1.s"]),
+        ("flip=False", "flip=True", ["val.pipeline.2.flip = True", "test.pipeline.2.flip = True"]),
+        ("scale=(1600, 900)", "scale=[(1600, 900), (800, 450)]", ["val.pipeline.2.img_scale"]),
+        ("scale_ratio=1", "scale_ratio=0.5", ["test.pipeline.2.pts_scale_ratio = 0.5"]),
+        (TESTED, "transforms=[train_pipeline[3]]", ["data.test.pipeline.PadMultiViewImage = None"]),
+        (TESTED, OF_TEST.format("train_pipeline[1], train_pipeline[3]"), ["'PhotoMetric"]),
+    ],
+)
+def test_steps_that_cannot_be_converted_are_named(theirs, other, named, tmp_path):
+    cfg, unplaced = converted(replaced(theirs, other), tmp_path)
+    assert scales(cfg) == [0.5, 0.5, 0.5]
+    for name in named:
+        assert any(name in line for line in unplaced)
+
+
+def test_images_without_a_step_are_neither_normalised_nor_padded(tmp_path):
+    text = without(NORMALISE, PAD).replace(TESTED, "transforms=[train_pipeline[2]]")
+    cfg, unplaced = converted(text, tmp_path)
+    assert unplaced == [BASE]
+    images = torch.rand(1, 1, 3, 450, 800) * 255
+    preprocessor = MODELS.build(cfg.model.data_preprocessor)
+    torch.testing.assert_close(preprocessor.normalise(images), images)
+
+
+def test_another_normalisation_of_the_test_is_named(tmp_path):
+    first, second = upstream_configs.maptr().split("test_pipeline = [")
+    for other, named in (("", "NormalizeMultiviewImage = None"), ("mean", "'mean': [1, 2, 3]")):
+        step = NORMALISE.replace("**norm", "mean=[1, 2, 3], std=[1, 1, 1]") if other else ""
+        text = f"{first}test_pipeline = [{second.replace(NORMALISE, step)}"
+        cfg, unplaced = converted(text, tmp_path)
+        assert cfg.model.data_preprocessor.mean == [123.675, 116.28, 103.53]
+        for part in ("val", "test"):
+            assert any(f"data.{part}" in line and named in line for line in unplaced)
+
+
+def test_padding_to_another_multiple_arrives(tmp_path):
+    text = upstream_configs.maptr(**upstream_configs.LIFTED).replace("divisor=32", "divisor=64")
+    cfg, unplaced = converted(text, tmp_path)
+    assert unplaced == [BASE]
+    assert cfg.model.data_preprocessor.pad_size_divisor == 64
+
+
+@pytest.mark.parametrize(
+    ("theirs", "other", "expected"),
+    [
+        (WARM_UP, "", [COSINE]),
+        (WARM_UP, "warmup=None, warmup_iters=500,", [COSINE]),
+        (", warmup_ratio=1.0 / 3", "", [{**LINEAR, "start_factor": 0.1}, COSINE]),
+        ("min_lr_ratio=1e-3", "min_lr_ratio=0.0", [LINEAR, {**COSINE, "eta_min_ratio": 0.0}]),
+        (
+            "min_lr_ratio=1e-3",
+            "min_lr=1e-6",
+            [LINEAR, {"type": "CosineAnnealingLR", "by_epoch": True, "eta_min": 1e-6}],
+        ),
+        (f"CosineAnnealing', {WARM_UP}\n    min_lr_ratio=1e-3", f"fixed', {WARM_UP}", [LINEAR]),
+        (f"policy='CosineAnnealing', {WARM_UP}\n    min_lr_ratio=1e-3", "", []),
+        (
+            f"CosineAnnealing', {WARM_UP}\n    min_lr_ratio=1e-3",
+            "step', step=[20, 22]",
+            [{"type": "MultiStepLR", "by_epoch": True, "milestones": [20, 22], "gamma": 0.1}],
+        ),
+    ],
+)
+def test_the_learning_rate_follows_the_file(theirs, other, expected, tmp_path):
+    cfg, unplaced = converted(replaced(theirs, other), tmp_path)
+    assert [scheduler.to_dict() for scheduler in cfg.param_scheduler] == expected
+    assert unplaced == [BASE]
+    check_config(cfg)
+
+
+def test_an_optimizer_without_other_sections_has_none_of_ours(tmp_path):
+    """One rate for all parameters, which stays constant, and no clipping."""
+    text = upstream_configs.maptr()
+    start = text.index("optimizer_config = ")
+    stop = text.index("total_epochs = ")
+    text = f"{text[:start]}{text[stop:]}".replace(PARAMWISE, "")
+    cfg, unplaced = converted(text, tmp_path)
+    assert unplaced == [BASE]
+    assert cfg.param_scheduler == []
+    assert cfg.optim_wrapper.clip_grad is None
+    wrapper = build_optim_wrapper(
+        torch.nn.ModuleDict({"img_backbone": torch.nn.Linear(2, 2)}), cfg.optim_wrapper
+    )
+    assert [group["lr"] for group in wrapper.optimizer.param_groups] == [6e-4]
+    check_config(cfg)
+
+
+def test_a_file_without_a_schedule_keeps_ours_and_a_message_says_so(tmp_path):
+    text = upstream_configs.maptr()
+    start = text.index("optimizer = ")
+    stop = text.index("evaluation = ")
+    text = f"{text[:start]}{text[stop:]}"
+    runner = "runner = dict(type='EpochBasedRunner', max_epochs=total_epochs)\n"
+    assert runner in text
+    cfg, unplaced = converted(text.replace(runner, ""), tmp_path)
+    wanted, _ = converted(upstream_configs.maptr(), tmp_path)
+    assert cfg.to_dict() == wanted.to_dict()
+    assert unplaced == [BASE, "optimizer = None", "total_epochs = None"]
+
+
+def test_what_a_schedule_cannot_have_here_is_named(tmp_path):
+    constructor = "type='AdamW', constructor='LayerDecayOptimizerConstructor',"
+    _, unplaced = converted(replaced("type='AdamW',", constructor), tmp_path)
+    assert unplaced == [BASE, "optimizer.constructor = 'LayerDecayOptimizerConstructor'"]
+    _, unplaced = converted(replaced("warmup='linear'", "warmup='exp'"), tmp_path)
+    assert "lr_config.warmup = 'exp'" in unplaced
+    with pytest.raises(ValueError, match=r"lr_config\.min_lr_ratio is missing"):
+        converted(replaced("min_lr_ratio=1e-3", ""), tmp_path)

@@ -21,6 +21,7 @@ UPSTREAM_LOSSES = upstream_configs.LOSSES.format(pts=5.0, dir=0.005) + (
     "num_ins=50, num_pts=points, pc_range=range_m, loss_type='l1')"
 )
 SHARED = {  # by the simple and the full objective of the authors' code
+    "prefix": "GeMap",
     "layer": upstream_configs.decoder_layer("GeometryDecoupledAttention"),
     "decay": 0.03,
     "evaluate": 1,

@@ -1,6 +1,6 @@
 """Settings of a method's original config that are not converted to GSMap settings yet."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 from gsmap.utils.errors import InputError
@@ -20,6 +20,7 @@ class Fields:
 
     def __init__(self, values: dict[str, Any]) -> None:
         self._values = values
+        self._notes: list[str] = []
 
     def section(self, name: str) -> dict[str, Any]:
         """Look up the settings below a name.
@@ -110,13 +111,33 @@ class Fields:
             if name in values and _as_list(values[name]) == _as_list(value):
                 values.pop(name)
 
+    def drop_type(self, section: str, types: Collection[str]) -> None:
+        """Remove the type of a part if it is supported. Another type remains.
+
+        Args:
+            section: Dotted name of the section of the part.
+            types: Supported types.
+        """
+        values = self.section(section)
+        if values.get("type") in types:
+            values.pop("type")
+
+    def note(self, name: str, value: Any) -> None:
+        """Add a line to the remaining settings, for a value that is not in the config itself.
+
+        Args:
+            name: Dotted name.
+            value: Value, also None, which is the value of a missing setting.
+        """
+        self._notes.append(f"{name} = {value!r}")
+
     def left_over(self) -> list[str]:
-        """List the remaining settings except None, each as ``name = value``."""
+        """List the remaining settings except None, and the notes, each as ``name = value``."""
         lines = []
         for name, value in _leaves(self._values, path=""):
             if value is not None:
                 lines.append(f"{name} = {value!r}")
-        return lines
+        return lines + self._notes
 
 
 def _as_list(value: Any) -> Any:

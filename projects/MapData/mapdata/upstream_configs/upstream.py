@@ -17,8 +17,33 @@ from mmengine.config import Config
 
 from gsmap.methods import METHODS
 from gsmap.utils.errors import InputError
-from mapdata.upstream_configs.data import FLAT, data_settings, schedule_settings
+from mapdata.upstream_configs.data import PARTS, data_settings, schedule_settings
 from mapdata.upstream_configs.fields import Fields
+from mapdata.upstream_configs.names import (
+    BEV,
+    COSTS,
+    CROSS_ATTENTIONS,
+    DECODER,
+    ENCODER,
+    FIXED_TYPES,
+    FIXED_VALUES,
+    HEAD,
+    HEAD_DEFAULTS,
+    IGNORED_NAMES,
+    KINDS,
+    LAYER,
+    MODEL_NAMES,
+    ORDER,
+    PILLAR_NAMES,
+    PREFIXED_TYPES,
+    PTS_HEAD,
+    SEGMENTATIONS,
+    SELF_ATTENTIONS,
+    SPATIAL,
+    SPATIAL_ATTENTIONS,
+    TRANSFORMER,
+    WEIGHTS,
+)
 
 # Keys and types of values that may be written to a config, which is executed as Python.
 _KEY = re.compile(r"[a-zA-Z][\w.-]*", re.ASCII)
@@ -29,94 +54,6 @@ TOP_LEVEL_NAMES = (
     "runner", "evaluation", "fp16", "checkpoint_config", "log_config", "load_from",
     "resume_from", "custom_hooks", "momentum_config", "cudnn_benchmark", "find_unused_parameters",
 )  # fmt: skip
-# sections of a GSMap config
-_HEAD = "model.map_head."
-_DECODER = _HEAD + "decoder."
-_BEV = "model.bev_encoder."
-# sections of an original config
-_PTS_HEAD = "model.pts_bbox_head"
-_TRAINING = "model.train_cfg.pts"
-_COSTS = f"{_TRAINING}.assigner"
-_TRANSFORMER = f"{_PTS_HEAD}.transformer"
-_ENCODER = f"{_TRANSFORMER}.encoder"
-_PILLARS = f"{_ENCODER}.transformerlayers"
-_SPATIAL = f"{_PILLARS}.attn_cfgs.1"  # the second attention; the first one is temporal
-_LAYER = f"{_TRANSFORMER}.decoder.transformerlayers"
-# names in GSMap of settings of the model, by name in an original config
-MODEL_NAMES = {
-    f"{_TRANSFORMER}.decoder.num_layers": _DECODER + "num_layers",
-    f"{_LAYER}.feedforward_channels": _DECODER + "layer.ffn_dims",
-    f"{_LAYER}.ffn_dropout": _DECODER + "layer.dropout",
-    f"{_PTS_HEAD}.num_pts_per_vec": _HEAD + "num_points",
-    f"{_PTS_HEAD}.bbox_coder.max_num": _HEAD + "coder.max_num",
-    f"{_PTS_HEAD}.loss_cls": _HEAD + "loss_cls",
-    f"{_PTS_HEAD}.loss_pts.loss_weight": _HEAD + "losses.0.loss_weight",
-    f"{_PTS_HEAD}.loss_dir.loss_weight": _HEAD + "losses.1.loss_weight",
-    f"{_COSTS}.cls_cost.weight": _HEAD + "match_costs.0.weight",
-    f"{_COSTS}.pts_cost.weight": _HEAD + "match_costs.1.weight",
-}
-# names in GSMap of settings of BEVFormer's encoder, by name in an original config
-PILLAR_NAMES = {
-    f"{_ENCODER}.num_layers": _BEV + "num_layers",
-    f"{_PILLARS}.feedforward_channels": _BEV + "layer_cfg.ffn_dims",
-    f"{_PILLARS}.ffn_dropout": _BEV + "layer_cfg.dropout",
-}
-# supported types of the parts of an original model, by section
-KINDS: dict[str, tuple[str, ...]] = {
-    _ENCODER: ("BEVFormerEncoder", "LSSTransform"),
-    _LAYER: ("DetrTransformerDecoderLayer", "DecoupledDetrTransformerDecoderLayer"),
-}
-_SELF_ATTENTIONS = ("MultiheadAttention", "GeometryDecoupledAttention")
-_CROSS_ATTENTIONS = ("CustomMSDeformableAttention",)
-_SPATIAL_ATTENTIONS = ("GeometrySptialCrossAttention", "SpatialCrossAttention")
-_ORDER = ("self_attn", "norm", "cross_attn", "norm", "ffn", "norm")  # steps of a layer
-# Settings for which GSMap supports only one value, by section. They are dropped if they have it,
-# and reported otherwise.
-FIXED_VALUES: dict[str, dict[str, Any]] = {
-    "model": {"video_test_mode": False},
-    _PTS_HEAD: {
-        "query_embed_type": "instance_pts", "transform_method": "minmax",
-        "gt_shift_pts_pattern": "v2", "with_box_refine": True, "as_two_stage": False,
-        "sync_cls_avg_factor": True, "code_size": 2, "dir_interval": 1, "z_cfg": FLAT,
-    },
-    f"{_PTS_HEAD}.positional_encoding": {"type": "LearnedPositionalEncoding"},
-    f"{_PTS_HEAD}.aux_seg": {"seg_classes": 1, "use_aux_seg": True},
-    f"{_ENCODER}.depthnet_cfg": {"use_dcn": False, "with_cp": False},
-    _PILLARS: {"operation_order": _ORDER},
-    f"{_SPATIAL}.attention": {"dilation": 1, "num_levels": 1},
-    f"{_SPATIAL}.deformable_attention": {"num_levels": 1},
-    **{section: {"z_cfg": FLAT} for section in (f"{_PTS_HEAD}.bbox_coder", _TRANSFORMER, _COSTS)},
-}  # fmt: skip
-# Names of the weights of parts, by section. A part whose weight is zero has no effect and is
-# dropped.
-WEIGHTS = {
-    f"{_PTS_HEAD}.loss_bbox": "loss_weight", f"{_PTS_HEAD}.loss_iou": "loss_weight",
-    f"{_COSTS}.reg_cost": "weight", f"{_COSTS}.iou_cost": "weight",
-}  # fmt: skip
-# settings that follow from other settings or have no effect in GSMap: names separated by spaces, by
-# section
-IGNORED_NAMES = {
-    "model": "type",
-    _PTS_HEAD: "type num_query in_channels code_weights",
-    f"{_PTS_HEAD}.positional_encoding": "num_feats row_num_embed col_num_embed",
-    f"{_PTS_HEAD}.bbox_coder": "type pc_range voxel_size num_classes",
-    f"{_PTS_HEAD}.aux_seg": "feat_down_sample pv_thickness",
-    **dict.fromkeys(
-        [f"{_PTS_HEAD}.loss_{name}" for name in ("pts", "dir", "seg", "pv_seg")], "type"
-    ),
-    _TRAINING: "grid_size voxel_size point_cloud_range out_size_factor",
-    _COSTS: "type pc_range",
-    **dict.fromkeys([f"{_COSTS}.cls_cost", f"{_COSTS}.pts_cost"], "type"),
-    _TRANSFORMER: "type rotate_prev_bev use_shift use_can_bus",
-    _ENCODER: "pc_range return_intermediate voxel_size grid_config in_channels",
-    _PILLARS: "type",
-    f"{_PILLARS}.attn_cfgs.0": "type embed_dims num_levels",
-    _SPATIAL: "embed_dims pc_range num_cams",
-    f"{_SPATIAL}.attention": "type embed_dims im2col_step",
-    f"{_SPATIAL}.deformable_attention": "type embed_dims im2col_step",
-    f"{_TRANSFORMER}.decoder": "type return_intermediate",
-    _LAYER: "num_vec num_pts_per_vec",
-}
 
 
 @dataclass
@@ -126,13 +63,14 @@ class Conversion:
     Args:
         base: Path of the GSMap config to modify, relative to ``configs``.
         settings: Values by dotted name in GSMap. A number in a name is an index of a list.
-        steps: Settings of the steps of the data pipelines, by type of the step; None removes it.
+        steps: Settings of the steps of the data pipelines, by part (``train``, ``val`` and
+            ``test``) and type of the step; None removes it.
         unplaced: Settings without a counterpart in GSMap, each as ``name = value``.
     """
 
     base: str
     settings: dict[str, Any]
-    steps: dict[str, dict[str, Any] | None]
+    steps: dict[str, dict[str, dict[str, Any] | None]]
     unplaced: list[str]
 
 
@@ -152,10 +90,12 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
     models = _entries("models")
     heads = [f"{model}Head" for model in models]
     _check_kind(fields, "model", kinds=models)
-    _check_kind(fields, _PTS_HEAD, kinds=heads)
+    _check_kind(fields, PTS_HEAD, kinds=heads)
     for section, kinds in KINDS.items():
         _check_kind(fields, section, kinds=kinds)
     model = fields.section("model")["type"]
+    for name, default in HEAD_DEFAULTS.items():
+        fields.section(PTS_HEAD).setdefault(name, default)
     settings = data_settings(fields)
     settings |= schedule_settings(fields)
     settings |= _image_settings(fields)
@@ -171,9 +111,7 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
         values = fields.section(section)  # the dict in `fields`, not a copy
         if values.get(weight) == 0:
             values.clear()
-    for section in {**IGNORED_NAMES, **FIXED_VALUES}:  # sections of either mapping
-        fixed_values = FIXED_VALUES.get(section, {})
-        fields.drop(section, names=IGNORED_NAMES.get(section, ""), **fixed_values)
+    _drop_settings(fields, pc_range=settings.pop("pc_range"))
     # These two select the base config and are no settings of GSMap.
     data_set = settings.pop("data_set")
     has_depth = settings.pop("with_depth")
@@ -184,6 +122,25 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
         steps=settings.pop("steps"),
         unplaced=fields.left_over(),
     )
+
+
+def _drop_settings(fields: Fields, pc_range: Sequence[float]) -> None:
+    """Drop the types and settings that GSMap does not need or that have the supported value.
+
+    Args:
+        fields: Settings of the original config.
+        pc_range: Range of the data in metres, which all parts must have.
+    """
+    for section in {**IGNORED_NAMES, **FIXED_VALUES}:  # sections of either mapping
+        fixed_values = FIXED_VALUES.get(section, {})
+        fields.drop(section, names=IGNORED_NAMES.get(section, ""), **fixed_values)
+    for section in (f"{PTS_HEAD}.bbox_coder", f"{PTS_HEAD}.loss_geo", ENCODER, COSTS):
+        fields.drop(section, pc_range=pc_range)
+    for section, types in FIXED_TYPES.items():
+        fields.drop_type(section, types)
+    prefixes = _entries("prefixes")
+    for section, name in PREFIXED_TYPES.items():
+        fields.drop_type(section, [f"{prefix}{name}" for prefix in prefixes])
 
 
 def _entries(key: str) -> list[Any]:
@@ -221,14 +178,15 @@ def merge(conversion: Conversion, configs: Path) -> Config:
                 section = section[int(section_key)]
             else:
                 section = section.setdefault(section_key, {})
-        section[key] = value
+        # An empty list only replaces a list of the base config.
+        if value != [] or key in section:
+            section[key] = value
     cfg = Config(values)
-    # `steps` has settings for steps of this type in all three pipelines.
-    for part in ("train", "val", "test"):
+    for part in PARTS:
         dataset = cfg[f"{part}_dataloader"].dataset
         pipeline = []
         for step in dataset.pipeline:
-            changes = conversion.steps.get(step.type, {})
+            changes = conversion.steps[part].get(step.type, {})
             if changes is not None:
                 pipeline.append({**step, **changes})
         dataset.pipeline = pipeline
@@ -391,56 +349,77 @@ def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[flo
         Type of the encoder or of its spatial attention; ``PlainLSSTransform`` for a depth network
         without camera parameters.
     """
-    kind: str = fields.take(f"{_ENCODER}.type")
-    embed_dims = fields.take(f"{_TRANSFORMER}.embed_dims", default=256)
-    settings[_BEV + "embed_dims"] = embed_dims
-    settings[_HEAD + "embed_dims"] = embed_dims
-    rows = fields.take(f"{_PTS_HEAD}.bev_h")
-    columns = fields.take(f"{_PTS_HEAD}.bev_w")
+    kind: str = fields.take(f"{ENCODER}.type")
+    embed_dims = fields.take(f"{TRANSFORMER}.embed_dims", default=256)
+    settings[BEV + "embed_dims"] = embed_dims
+    settings[HEAD + "embed_dims"] = embed_dims
+    rows = fields.take(f"{PTS_HEAD}.bev_h")
+    columns = fields.take(f"{PTS_HEAD}.bev_w")
     x_min, x_max, y_min, y_max = sides
     pixel_x_m = (x_max - x_min) / columns
     pixel_y_m = (y_max - y_min) / rows
     is_square = abs(pixel_x_m - pixel_y_m) < 1e-6
-    settings[_BEV + "z_range"] = tuple(settings.pop("z_range"))  # from `data_settings`
-    settings[_BEV + "bev_pixel_m"] = pixel_x_m if is_square else [pixel_x_m, pixel_y_m]
+    settings[BEV + "z_range"] = tuple(settings.pop("z_range"))  # from `data_settings`
+    settings[BEV + "bev_pixel_m"] = pixel_x_m if is_square else [pixel_x_m, pixel_y_m]
     if kind == "LSSTransform":
-        fields.drop(_ENCODER, names="out_channels feat_down_sample", downsample=2)
-        encoder = fields.section(_ENCODER)
+        fields.drop(ENCODER, names="out_channels feat_down_sample", downsample=2)
+        fields.drop(TRANSFORMER, names="num_cams")  # depth lifting has no embeddings of cameras
+        _drop_voxels(fields, settings=settings, pixel_m=(pixel_x_m, pixel_y_m))
+        encoder = fields.section(ENCODER)
         # The depth network reads camera parameters if it has settings or a loss of depths. Without
         # them, MapTR's encoder is a plain one.
         reads_cameras = "depthnet_cfg" in encoder or "loss_depth_weight" in encoder
         if fields.section("model").get("type") == "MapTR" and not reads_cameras:
             kind = "PlainLSSTransform"
-        aspp_channels = fields.take(f"{_ENCODER}.depthnet_cfg.aspp_mid_channels", default=96)
-        settings[_BEV + "depth_range"] = tuple(fields.take(f"{_ENCODER}.dbound"))
-        settings[_BEV + "aspp_channels"] = aspp_channels
+        aspp_channels = fields.take(f"{ENCODER}.depthnet_cfg.aspp_mid_channels", default=96)
+        depth_range = fields.take(f"{ENCODER}.dbound")
+        fields.drop(f"{ENCODER}.grid_config", names="x y z", depth=depth_range)
+        settings[BEV + "depth_range"] = tuple(depth_range)
+        settings[BEV + "aspp_channels"] = aspp_channels
         return kind
-    fields.drop(_ENCODER, num_points_in_pillar=4)
-    settings[_BEV + "with_can_bus"] = fields.take(f"{_TRANSFORMER}.use_can_bus", default=True)
-    settings[_BEV + "num_cams"] = fields.take(f"{_TRANSFORMER}.num_cams", default=6)
+    fields.drop(ENCODER, num_points_in_pillar=4)
+    settings[BEV + "with_can_bus"] = fields.take(f"{TRANSFORMER}.use_can_bus", default=True)
+    settings[BEV + "num_cams"] = fields.take(f"{TRANSFORMER}.num_cams", default=6)
     settings |= fields.move(PILLAR_NAMES)
-    _check_kind(fields, _SPATIAL, kinds=_SPATIAL_ATTENTIONS)
-    kind = fields.take(f"{_SPATIAL}.type")
-    attention = _BEV + "cross_attn."
+    _check_kind(fields, SPATIAL, kinds=SPATIAL_ATTENTIONS)
+    kind = fields.take(f"{SPATIAL}.type")
+    attention = BEV + "cross_attn."
     if kind == "GeometrySptialCrossAttention":
-        kernel_size = fields.take(f"{_SPATIAL}.attention.kernel_size")
-        settings[attention + "num_heads"] = fields.take(f"{_SPATIAL}.attention.num_heads")
+        kernel_size = fields.take(f"{SPATIAL}.attention.kernel_size")
+        settings[attention + "num_heads"] = fields.take(f"{SPATIAL}.attention.num_heads")
         settings[attention + "kernel_size"] = tuple(kernel_size)
     else:
-        num_points = fields.take(f"{_SPATIAL}.deformable_attention.num_points", default=8)
+        num_points = fields.take(f"{SPATIAL}.deformable_attention.num_points", default=8)
         settings[attention + "num_points"] = num_points
     return kind
 
 
+def _drop_voxels(fields: Fields, settings: dict[str, Any], pixel_m: tuple[float, float]) -> None:
+    """Drop the size of the voxels of a depth network if it is the one that GSMap has.
+
+    Args:
+        fields: Settings of the original config.
+        settings: Converted settings, with the range of the heights.
+        pixel_m: Size of a BEV pixel in metres along x and y. Two voxels become one pixel.
+    """
+    voxel_size = fields.section(ENCODER).get("voxel_size", ())
+    z_min, z_max = settings[BEV + "z_range"]
+    expected = (pixel_m[0] / 2, pixel_m[1] / 2, z_max - z_min)
+    if len(voxel_size) == 3:
+        differences = [abs(a - b) for a, b in zip(voxel_size, expected, strict=True)]
+        if max(differences) < 1e-6:
+            fields.drop(ENCODER, names="voxel_size")
+
+
 def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     """Convert the settings of the decoder's attentions and add them to ``settings``."""
-    layer = _DECODER + "layer."
-    layer_kind = fields.take(f"{_LAYER}.type")
+    layer = DECODER + "layer."
+    layer_kind = fields.take(f"{LAYER}.type")
     # Dotted names of the attentions. A decoupled layer has a second self-attention with the
     # settings of the first.
-    self_attention, *other_attentions, cross_attention = fields.items(f"{_LAYER}.attn_cfgs")
-    _check_kind(fields, self_attention, kinds=_SELF_ATTENTIONS)
-    _check_kind(fields, cross_attention, kinds=_CROSS_ATTENTIONS)
+    self_attention, *other_attentions, cross_attention = fields.items(f"{LAYER}.attn_cfgs")
+    _check_kind(fields, self_attention, kinds=SELF_ATTENTIONS)
+    _check_kind(fields, cross_attention, kinds=CROSS_ATTENTIONS)
     kind = fields.take(f"{self_attention}.type")
     num_heads = fields.take(f"{self_attention}.num_heads")
     settings[layer + "num_heads"] = num_heads
@@ -450,11 +429,14 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     elif kind == "MultiheadAttention":
         kind = "PointSelfAttention"
     settings[layer + "self_attn.type"] = kind
-    fields.drop(self_attention, names="embed_dims num_ins num_pts")
-    fields.drop(_LAYER, operation_order=("self_attn", "norm") * len(other_attentions) + _ORDER)
+    num_queries = fields.section(PTS_HEAD).get("num_vec")
+    num_points = settings[HEAD + "num_points"]
+    fields.drop(self_attention, names="embed_dims", num_ins=num_queries, num_pts=num_points)
+    fields.drop(LAYER, operation_order=("self_attn", "norm") * len(other_attentions) + ORDER)
     dropout = fields.section(self_attention).get("dropout")
     for attention in other_attentions:
-        fields.drop(attention, names="type embed_dims", num_heads=num_heads, dropout=dropout)
+        fields.drop_type(attention, ("MultiheadAttention",))
+        fields.drop(attention, names="embed_dims", num_heads=num_heads, dropout=dropout)
     fields.drop(cross_attention, names="type embed_dims num_levels im2col_step")
     # The original attentions have different default dropouts. In GSMap, the default is the dropout
     # of the layer.
@@ -469,57 +451,85 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
 def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
     """Convert the settings of queries and losses and add them, with the head, to ``settings``."""
     num_classes = len(settings["classes"])
-    num_points = settings[_HEAD + "num_points"]
-    fields.drop(_PTS_HEAD, num_classes=num_classes, num_pts_per_gt_vec=num_points)
-    loss_cls = settings[_HEAD + "loss_cls"]
+    num_points = settings[HEAD + "num_points"]
+    fields.drop(PTS_HEAD, num_classes=num_classes, num_pts_per_gt_vec=num_points)
+    fields.drop(f"{PTS_HEAD}.bbox_coder", num_classes=num_classes)
+    loss_cls = settings[HEAD + "loss_cls"]
     loss_cls["type"] = f"mmdet.{loss_cls['type']}"
 
     def take(name: str, default: Any) -> Any:
-        return fields.take(f"{_PTS_HEAD}.{name}", default=default)
+        return fields.take(f"{PTS_HEAD}.{name}", default=default)
 
     # MapTR has `num_vec`. MapTRv2 has `num_vec_one2one`, and groups for one-to-many matching.
-    num_queries = take("num_vec_one2one", default=None) or fields.take(f"{_PTS_HEAD}.num_vec")
+    num_queries = take("num_vec_one2one", default=None) or fields.take(f"{PTS_HEAD}.num_vec")
     one2many = {
         "name": "one2many",
         "num": take("num_vec_one2many", default=0),
-        "repeats": take("k_one2many", default=6),
+        "repeats": take("k_one2many", default=0),
         "weight": take("lambda_one2many", default=1.0),
     }
     query_groups = [{"num": num_queries}]
     if one2many["num"]:
+        if not one2many["repeats"]:
+            raise InputError(f"{PTS_HEAD}.k_one2many is missing.")
         query_groups.append(one2many)
-    settings[_HEAD + "query_groups"] = query_groups
+    settings[HEAD + "query_groups"] = query_groups
     _rendered_mask_settings(fields, settings)
-    # The Euclidean loss of GeMap.
-    if take("use_geo_loss", default=False):
-        fields.drop(_PTS_HEAD, names="intra_loss_weight inter_loss_weight")
-        fields.drop(f"{_PTS_HEAD}.loss_geo", names="type num_ins num_pts pc_range", loss_type="l1")
-        settings[_HEAD + "type"] = "GeMapHead"
-        settings[_HEAD + "loss_euclidean"] = {
-            "loss_weight": fields.take(f"{_PTS_HEAD}.loss_geo.loss_weight"),
-            "shape_weight": take("loss_geo.intra_loss_weight", default=1.0),
-            "relation_weight": take("loss_geo.inter_loss_weight", default=1.0),
-        }
+    _geometric_loss_settings(fields, settings)
+    _auxiliary_settings(fields, settings)
+
+
+def _geometric_loss_settings(fields: Fields, settings: dict[str, Any]) -> None:
+    """Convert the settings of the Euclidean loss (GeMap) and add them, if it is on."""
+    loss = f"{PTS_HEAD}.loss_geo"
+    fields.drop(PTS_HEAD, names="intra_loss_weight inter_loss_weight")
+    if not fields.take(f"{PTS_HEAD}.use_geo_loss", default=False):
+        fields.section(loss).clear()  # it has no effect
+        return
+    num_queries = settings[HEAD + "query_groups"][0]["num"]
+    num_points = settings[HEAD + "num_points"]
+    fields.drop_type(loss, ("GeometricLoss",))
+    fields.drop(loss, num_ins=num_queries, num_pts=num_points, loss_type="l1")
+    settings[HEAD + "type"] = "GeMapHead"
+    settings[HEAD + "loss_euclidean"] = {
+        "loss_weight": fields.take(f"{loss}.loss_weight"),
+        "shape_weight": fields.take(f"{loss}.intra_loss_weight", default=1.0),
+        "relation_weight": fields.take(f"{loss}.inter_loss_weight", default=1.0),
+    }
+
+
+def _auxiliary_settings(fields: Fields, settings: dict[str, Any]) -> None:
+    """Convert the settings of segmentation and depth. Other auxiliary heads are removed."""
     aux_heads: list[dict[str, Any]] = []
-    # Switch and loss of each segmentation in the original head, and its auxiliary head in GSMap.
-    segmentations = (
-        ("bev_seg", "loss_seg", "BEVMaskHead"),
-        ("pv_seg", "loss_pv_seg", "PVMaskHead"),
-    )
-    for flag, loss, kind in segmentations:
-        # The weights are taken in any case, so that a segmentation that is off leaves no settings.
+    steps = settings["steps"]["train"]
+    aux_seg = f"{PTS_HEAD}.aux_seg"
+    is_on = fields.take(f"{aux_seg}.use_aux_seg", default=False)
+    # Settings of the masks of the camera views.
+    mask_names = {
+        f"{aux_seg}.feat_down_sample": "stride",
+        f"{aux_seg}.pv_thickness": "thickness_px",
+    }
+    steps["MakePVMask"] |= fields.move(mask_names, required=False)
+    for flag, loss, head, step in SEGMENTATIONS:
+        section = f"{PTS_HEAD}.{loss}"
+        if not fields.take(f"{aux_seg}.{flag}", default=False) or not is_on:
+            fields.section(section).clear()  # it has no effect
+            steps[step] = None
+            continue
+        fields.drop_type(section, ("SimpleLoss",))
         mask_head = {
-            "type": kind,
-            "loss_weight": take(f"{loss}.loss_weight", default=None),
-            "pos_weight": take(f"{loss}.pos_weight", default=None),
+            "type": head,
+            "loss_weight": fields.take(f"{section}.loss_weight", default=1.0),
+            "pos_weight": fields.take(f"{section}.pos_weight", default=2.13),
         }
-        if take(f"aux_seg.{flag}", default=False):
-            aux_heads.append(mask_head)
-    depth_weight = fields.take(f"{_ENCODER}.loss_depth_weight", default=None)
-    if depth_weight:
+        aux_heads.append(mask_head)
+    # Without depth maps, the original has no loss of depths either.
+    depth_weight = fields.take(f"{ENCODER}.loss_depth_weight", default=None)
+    if depth_weight and settings["with_depth"]:
         aux_heads.append({"type": "DepthSupervision", "loss_weight": depth_weight})
-    if aux_heads:
-        settings[_HEAD + "aux_heads"] = aux_heads
+    else:
+        steps["MakeDepthMap"] = None
+    settings[HEAD + "aux_heads"] = aux_heads
 
 
 def _rendered_mask_settings(fields: Fields, settings: dict[str, Any]) -> None:
@@ -530,26 +540,27 @@ def _rendered_mask_settings(fields: Fields, settings: dict[str, Any]) -> None:
         settings: Converted settings. The weights of the points and the directions are read, and the
             settings of MapVR's head are added.
     """
-    if not fields.take(f"{_PTS_HEAD}.loss_rendered_mask.type", default=None):
+    if not fields.section(f"{PTS_HEAD}.loss_rendered_mask"):
         return
-    points_weight = settings[f"{_HEAD}losses.0.loss_weight"]
-    direction_weight = settings[f"{_HEAD}losses.1.loss_weight"]
-    fields.drop(f"{_COSTS}.rendered_mask_cost", names="type")
-    dice_weight = fields.take(f"{_PTS_HEAD}.loss_rendered_mask.weight")
-    dice_cost_weight = fields.take(f"{_COSTS}.rendered_mask_cost.weight")
-    settings[_HEAD + "type"] = "MapVRHead"
-    settings[_HEAD + "points_weight"] = points_weight
-    settings[_HEAD + "loss_direction"] = {
+    points_weight = settings[f"{HEAD}losses.0.loss_weight"]
+    direction_weight = settings[f"{HEAD}losses.1.loss_weight"]
+    fields.drop_type(f"{PTS_HEAD}.loss_rendered_mask", ("RenderedMaskDiceLoss",))
+    fields.drop_type(f"{COSTS}.rendered_mask_cost", ("RenderedMaskDiceCost",))
+    dice_weight = fields.take(f"{PTS_HEAD}.loss_rendered_mask.weight")
+    dice_cost_weight = fields.take(f"{COSTS}.rendered_mask_cost.weight")
+    settings[HEAD + "type"] = "MapVRHead"
+    settings[HEAD + "points_weight"] = points_weight
+    settings[HEAD + "loss_direction"] = {
         "type": "SelfDirectionLoss",
         "loss_weight": direction_weight,
     }
-    settings[_HEAD + "loss_dice"] = {"loss_weight": dice_weight}
-    settings[_HEAD + "dice_cost"] = {"weight": dice_cost_weight}
-    cost_weight = settings[_HEAD + "match_costs.1.weight"]
+    settings[HEAD + "loss_dice"] = {"loss_weight": dice_weight}
+    settings[HEAD + "dice_cost"] = {"weight": dice_cost_weight}
+    cost_weight = settings[HEAD + "match_costs.1.weight"]
     if points_weight != cost_weight:
         # GSMap has one weight for both loss and cost. A different cost weight is put back into the
         # section, so that it is reported as unplaced.
-        fields.section(f"{_COSTS}.pts_cost")["weight"] = cost_weight
+        fields.section(f"{COSTS}.pts_cost")["weight"] = cost_weight
 
 
 def _margin_settings(fields: Fields, settings: dict[str, Any], sides: tuple[float, ...]) -> None:
@@ -565,12 +576,12 @@ def _margin_settings(fields: Fields, settings: dict[str, Any], sides: tuple[floa
     # GSMap has one margin for all sides. In the original config, the box of a prediction has two
     # corners. `limits` are the smallest x and y of the first and of the second corner, then the
     # largest x and y of both.
-    limits = fields.section(f"{_PTS_HEAD}.bbox_coder").get("post_center_range", ())
+    limits = fields.section(f"{PTS_HEAD}.bbox_coder").get("post_center_range", ())
     if len(limits) != 8:
         return
     x_min, x_max, y_min, y_max = sides
     margins = {x_min - limits[0], y_min - limits[1], limits[4] - x_max, limits[5] - y_max}
     have_corners_equal_limits = limits[:2] == limits[2:4] and limits[4:6] == limits[6:]
     if len(margins) == 1 and have_corners_equal_limits:
-        fields.drop(f"{_PTS_HEAD}.bbox_coder", names="post_center_range")
-        settings[_HEAD + "coder.margin_m"] = float(margins.pop())
+        fields.drop(f"{PTS_HEAD}.bbox_coder", names="post_center_range")
+        settings[HEAD + "coder.margin_m"] = float(margins.pop())
