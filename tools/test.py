@@ -134,6 +134,7 @@ def main() -> None:
     from gsmap.checkpoints.reading import adopt_settings
     from gsmap.checkpoints.settings import dataset_of
     from gsmap.engine.launch import load_config
+    from gsmap.engine.map_agreement import check_map_agreement
     from gsmap.engine.run_log import MapRunner
 
     checkpoint = checkpoint_for(args.config, args.checkpoint)
@@ -145,6 +146,7 @@ def main() -> None:
     apply_options(cfg, args)
     if notes and is_first_rank():  # one of several processes prints
         print("\n".join(notes))
+    check_map_agreement(cfg, "test")  # of the checkpoint's model
     # `building` adds the names of the config's parts to errors. The stack closes the priors.
     with building(cfg), ExitStack() as stack:
         runner = MapRunner.from_cfg(cfg)

@@ -92,6 +92,28 @@ def choose_start(cfg: Config, resume: str | None) -> None:
             )
 
 
+def check_scaling(cfg: Config, runner_type: type) -> None:
+    """Require a runner that counts accumulated gradients where it scales the learning rate.
+
+    Args:
+        cfg: Config of the run.
+        runner_type: Class of the runner.
+
+    Raises:
+        ValueError: If another runner than GSMap's would scale for the batch size of an iteration.
+    """
+    from gsmap.engine.run_log import MapRunner
+
+    is_scaled = (cfg.get("auto_scale_lr") or {}).get("enable", False)
+    iterations = (cfg.get("optim_wrapper") or {}).get("accumulative_counts", 1)
+    if is_scaled and iterations != 1 and not issubclass(runner_type, MapRunner):
+        raise InputError(
+            f"{cfg.filename}: auto_scale_lr of {runner_type.__name__} would not count that "
+            f"optim_wrapper.accumulative_counts is {iterations}: leave out runner_type, or set "
+            "optim_wrapper.optimizer.lr in place of auto_scale_lr."
+        )
+
+
 def lock_work_dir(work_dir: str) -> AbstractContextManager:
     """Lock the work folder for this run. The first rank locks it for all ranks.
 
@@ -132,11 +154,12 @@ def main() -> None:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
             raise InputError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
+    # As in mmengine's tools, a config may name another class of runners.
+    runner_type = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
+    check_scaling(cfg, runner_type)
     # Locked before the checkpoint is chosen, so that no other run writes checkpoints meanwhile.
     with lock_work_dir(cfg.work_dir):
         choose_start(cfg, args.resume)
-        # As in mmengine's tools, a config may name another class of runners.
-        runner_type = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
         with building(cfg):  # adds the names of the config and of its parts to errors
             runner = runner_type.from_cfg(cfg)
             runner.train()

@@ -159,6 +159,16 @@ def test_file_of_another_range_is_refused(inferencer, tmp_path):
         other.dataset(tmp_path / "a.arrow", tmp_path)
 
 
+def test_a_model_of_other_classes_than_the_data_set_is_refused(tmp_path):
+    cfg = make_config()
+    cfg.test_dataloader.dataset.classes = list(cfg.model.classes)[::-1]
+    other = MapInferencer(cfg, None, device="cpu")
+    with pytest.raises(
+        ValueError, match=r"model\.classes is .*, but test_dataloader\.dataset\.clas"
+    ):
+        other.dataset(make_samples(tmp_path, 1), tmp_path)
+
+
 def test_missing_config_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no config .*gone.py"):
         MapInferencer(tmp_path / "gone.py", None)

@@ -179,6 +179,83 @@ def test_a_cosine_schedule_may_follow_a_warm_up(wrap, name):
         check_config(Config(cfg))
 
 
+@pytest.mark.parametrize(
+    ("scheduler", "epochs", "reason"),
+    [
+        ({"milestones": [100, 120]}, 121, None),
+        (
+            {"milestones": (100, 120)},
+            120,
+            r"comes after 120: set param_scheduler\.0\.milestones to",
+        ),
+        ({"milestones": [100, 120]}, 110, "lasts 110 epochs but the last milestone .* below 110,"),
+        ({"milestones": [20, 30], "begin": 5}, 36, None),
+        ({"milestones": [20, 30], "begin": 5}, 35, "comes after 35: .* to numbers below 30, or"),
+        ({"milestones": [900], "by_epoch": False}, 10, None),  # iterations
+        ({"milestones": []}, 1, None),
+    ],
+)
+def test_milestones_that_a_training_does_not_reach_are_refused(scheduler, epochs, reason):
+    cfg = Config({"train_cfg": {"max_epochs": epochs}, "param_scheduler": [scheduler]})
+    check_config(cfg, for_training=False)
+    if reason is None:
+        check_config(cfg)
+        return
+    with pytest.raises(ValueError, match=reason):
+        check_config(cfg)
+
+
+@pytest.mark.parametrize(
+    ("option", "split"),
+    [
+        ({"model.grid.x_range": [-10.0, 20.0]}, "train"),
+        ({"model.grid.y_range": [-30.0, 60.0]}, "train"),
+        ({"model.classes": ["ped_crossing", "divider", "boundary"]}, "train"),
+        ({"model.classes": ["a", "b", "c", "d"]}, "train"),
+        ({"train_dataloader.dataset.classes": ["divider"]}, "train"),
+        ({"val_dataloader.dataset.grid.x_range": [-15.0, 15.5]}, "val"),
+        ({"test_dataloader.dataset.classes": ["divider"]}, "test"),
+    ],
+)
+def test_a_model_for_another_map_than_its_data_is_refused(option, split):
+    cfg = read_config("maptr_r18_minicity", option)
+    (name,) = option
+    setting = name.removeprefix("model.").partition("dataset.")[2] or name.removeprefix("model.")
+    message = (
+        rf"model\.{setting} is \[.*\], but {split}_dataloader\.dataset\.{setting} is \[.*: set"
+    )
+    with pytest.raises(ValueError, match=message):
+        check_config(cfg)
+    if split == "test" or name.startswith("model."):
+        with pytest.raises(ValueError, match=rf"but test_dataloader\.dataset\.{setting} is"):
+            check_config(cfg, for_training=False)
+    else:  # a test reads no other data set
+        check_config(cfg, for_training=False)
+
+
+def test_equal_maps_may_be_written_in_several_ways_or_left_to_the_annotation_file():
+    options = {
+        "model.grid.x_range": (-15, 15),
+        "model.classes": ("divider", "ped_crossing", "boundary"),
+        "val_dataloader.dataset.classes": None,
+        "test_dataloader.dataset.grid": None,
+    }
+    check_config(read_config("maptr_r18_minicity", options))
+
+
+def test_maps_of_wrapped_data_sets_are_compared_too():
+    cfg = read_config("maptr_r18_minicity")
+    plain = cfg.train_dataloader.dataset.to_dict()
+    other = {"type": "RepeatDataset", "times": 2, "dataset": {**plain, "classes": ["divider"]}}
+    cfg.train_dataloader.dataset = {"type": "ConcatDataset", "datasets": [plain, plain]}
+    check_config(cfg)
+    cfg.train_dataloader.dataset = {"type": "ConcatDataset", "datasets": [plain, other]}
+    with pytest.raises(
+        ValueError, match=r"train_dataloader\.dataset\.datasets\.1\.dataset\.classes"
+    ):
+        check_config(cfg)
+
+
 def test_a_pipeline_without_a_target_of_a_head_is_refused():
     require_target("configs/maptr/maptr_r18_minicity.py", "FormatMapTargets", "MapHead")
 

@@ -13,6 +13,7 @@ from mmengine.dataset import ClassBalancedDataset, ConcatDataset, RepeatDataset
 from mmengine.evaluator import Evaluator
 from mmengine.evaluator.metric import DumpResults
 from mmengine.hooks import Hook
+from mmengine.optim import OptimWrapper, OptimWrapperDict
 from mmengine.runner import Runner
 from torch.utils.data import ConcatDataset as TorchConcat
 from torch.utils.data import Subset
@@ -70,6 +71,38 @@ def test_the_config_of_a_run_replaces_no_other_file(kind, tmp_path):
     assert source.read_text() == "a = 1  # my notes\n"
     assert (work / "mine.py").exists() == (kind != "input")
     assert kind == "input" or Config.fromfile(work / "mine.py").to_dict() == {"a": 1}
+
+
+@pytest.mark.parametrize(
+    ("counts", "base_batch_size", "enable", "rate"),
+    [(1, 8, True, 0.5), (4, 8, True, 2.0), (3, 8, True, 1.5), (4, 8, False, 1.0)],
+)
+@pytest.mark.parametrize("several", [False, True])
+def test_the_rate_is_scaled_to_the_samples_of_an_optimizer_step(
+    counts, base_batch_size, enable, rate, several, tmp_path
+):
+    """Batches of 4 samples; accumulated gradients have those of several batches."""
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.ones(1))], lr=1.0)
+    wrapper = OptimWrapper(optimizer, accumulative_counts=counts)
+    single = OptimWrapper(torch.optim.SGD([torch.nn.Parameter(torch.ones(1))], lr=1.0))
+    runner = MapRunner(
+        torch.nn.Linear(1, 1),
+        str(tmp_path),
+        train_dataloader=torch.utils.data.DataLoader([0] * 8, batch_size=4),
+        train_cfg={"by_epoch": True, "max_epochs": 1},
+        optim_wrapper=wrapper,
+        experiment_name=f"rate-{counts}-{enable}-{several}",
+        default_scope="mmdet3d",
+    )
+    settings = {"enable": enable, "base_batch_size": base_batch_size}
+    wrappers = OptimWrapperDict(a=wrapper, b=single) if several else wrapper
+    runner.scale_lr(wrappers, settings)
+    assert optimizer.param_groups[0]["lr"] == rate
+    unscaled = not (several and enable)
+    assert single.optimizer.param_groups[0]["lr"] == (1.0 if unscaled else 0.5)
+    assert settings == {"enable": enable, "base_batch_size": base_batch_size}  # unchanged
+    runner.scale_lr(wrapper)  # without settings
+    assert optimizer.param_groups[0]["lr"] == rate
 
 
 def run_with(counts, queries):

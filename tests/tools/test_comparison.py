@@ -94,6 +94,10 @@ def test_a_validation_without_figures_to_compare_is_refused(tiny_config, protoco
             "use different data: test.spl",
         ),
         (["a=CONFIG,train_cfg.max_epochs=5"], "leave it out"),
+        (
+            ["a=CONFIG", "b=CONFIG,optim_wrapper.accumulative_counts=2"],
+            r"different numbers of optimizer steps: .*accumulative_counts: 1 and 2\. Set one",
+        ),
         (["a=CONFIG,model.map_head.no_such_part=1"], "no_such_part"),
         (["a=CONFIG,optim_wraper.x=1"], "did you mean 'optim_wrapper'"),
     ],
@@ -184,6 +188,64 @@ def test_an_epoch_has_the_steps_of_its_data_loader(
     config = entries(leaf, "a=CONFIG,train_dataloader.dataset.indices=[0,1,0]")
     (run, _) = plan(config, replace(protocol, budget=6))
     assert run.epochs == 6 / steps
+
+
+def test_runs_that_accumulate_equally_are_compared(tiny_config, protocol):
+    options = "optim_wrapper.accumulative_counts=2"
+    texts = f"a=CONFIG,{options}", f"b=CONFIG,{options},optim_wrapper.optimizer.lr=1"
+    assert len(plan(entries(tiny_config, *texts), protocol)) == 4
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "epochs", "scaled"),
+    [
+        # of 110 epochs
+        ("type='MultiStepLR', milestones=[77, 99]", 110, {"milestones": [77, 99]}),
+        ("type='MultiStepLR', milestones=[77, 99]", 220, {"milestones": [154, 198]}),
+        ("type='MultiStepLR', milestones=[77, 99]", 20, {"milestones": [14, 18]}),
+        ("type='MultiStepLR', milestones=[77, 99]", 3, {"milestones": [1, 2]}),  # not 2 and 3
+        ("type='MultiStepLR', milestones=[1, 2, 3]", 11, {"milestones": [1, 2, 3]}),
+        ("type='MultiStepLR', milestones=[107, 108, 109]", 11, {"milestones": [8, 9, 10]}),
+        # 100 epochs after the first 10, then 50 after the first 10
+        ("type='MultiStepLR', milestones=[80], begin=10", 60, {"milestones": [40]}),
+        ("type='MultiStepLR', milestones=[900], by_epoch=False", 20, {"milestones": [900]}),
+        ("type='StepLR', step_size=10", 33, {"step_size": 3}),
+        ("type='StepLR', step_size=10", 2, {"step_size": 1}),
+        ("type='CosineAnnealingLR', T_max=100, begin=10", 60, {"T_max": 50}),
+    ],
+)
+def test_schedules_over_epochs_take_the_length_of_the_budget(
+    scheduler, epochs, scaled, tiny_config, protocol, tmp_path
+):
+    leaf = tmp_path / "leaf.py"
+    leaf.write_text(
+        f"_base_ = '{tiny_config}'\ntrain_cfg = dict(max_epochs=110)\n"
+        f"param_scheduler = [dict({scheduler})]\n"
+    )
+    (run, _) = plan(entries(leaf, "a=CONFIG"), replace(protocol, budget=epochs))
+    assert run.epochs == epochs
+    (settings,) = run.settings["param_scheduler"]
+    assert {name: settings[name] for name in scaled} == scaled
+
+
+@pytest.mark.parametrize(
+    ("milestones", "epochs"), [([77, 99], 2), ([77, 110], 20), ([77, 400], 20)]
+)
+def test_milestones_after_the_budget_are_refused(
+    milestones, epochs, tiny_config, protocol, tmp_path
+):
+    leaf = tmp_path / "leaf.py"
+    leaf.write_text(
+        f"_base_ = '{tiny_config}'\ntrain_cfg = dict(max_epochs=110)\n"
+        f"param_scheduler = [dict(type='MultiStepLR', milestones={milestones})]\n"
+    )
+    longer = replace(protocol, budget=epochs)
+    with pytest.raises(ValueError, match=rf"set param_scheduler\.0\.milestones .* below {epochs}"):
+        plan(entries(leaf, "a=CONFIG"), longer)
+    # The user's override takes precedence.
+    option = "param_scheduler.0.milestones=[1]"
+    (run, _) = plan(entries(leaf, f"a=CONFIG,{option}"), longer)
+    assert run.settings["param_scheduler"][0]["milestones"] == [1]
 
 
 def test_an_epoch_without_a_whole_batch_is_refused(tiny_config, protocol):

@@ -19,6 +19,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from waiting import waiting_config
 
 from gsmap.checkpoints.reading import read_checked
+from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
+from gsmap.engine.launch import read_config
 from gsmap.engine.run_log import MapRunner
 from tools import test as test_tool
 from tools.train import choose_start
@@ -250,6 +252,50 @@ def test_the_config_chooses_the_runner(tiny_config, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", [*words, "--cfg-options", "runner_type=FlexibleRunner"])
     train()
     assert [type(runner) for runner in built] == [FlexibleRunner]
+
+
+@pytest.mark.parametrize("runner_type", [None, "FlexibleRunner"])
+def test_a_scaled_rate_counts_accumulated_gradients(
+    runner_type, tiny_config, tmp_path, monkeypatch
+):
+    """The base batch size is 2, and an optimizer step has 4 batches of one sample."""
+    rates = []
+
+    def note(runner, optim_wrapper, auto_scale_lr=None):
+        scale(runner, optim_wrapper, auto_scale_lr)
+        rates.append(optim_wrapper.optimizer.param_groups[0]["lr"])
+        raise InterruptedError("that is enough")
+
+    scale = MapRunner.scale_lr
+    monkeypatch.setattr(MapRunner, "scale_lr", note)
+    words = ["train.py", str(tiny_config), "--work-dir", str(tmp_path), "--auto-scale-lr"]
+    words += ["--cfg-options", "optim_wrapper.accumulative_counts=4"]
+    words += [f"runner_type={runner_type}"] if runner_type else []
+    monkeypatch.setattr(sys, "argv", words)
+    if runner_type:
+        with pytest.raises(
+            ValueError, match=r"FlexibleRunner would not count .*_counts is 4: leav"
+        ):
+            train()
+        assert not rates
+        return
+    with pytest.raises(InterruptedError):
+        train()
+    assert rates == [pytest.approx(2 * 6e-4)]
+
+
+def test_a_checkpoint_of_other_classes_than_the_data_set_is_not_tested(tmp_path, monkeypatch):
+    settings = plain(read_config("gsmap_r18_minicity").model)
+    settings["classes"].reverse()
+    path = tmp_path / "other.pth"
+    meta = {MODEL_SETTINGS: json.dumps(settings)}
+    torch.save({"state_dict": {"w": torch.ones(1)}, "meta": meta}, path)
+    words = ["test.py", "gsmap_r18_minicity", str(path), "--work-dir", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(
+        ValueError, match=r"model\.classes is .*, but test_dataloader\.dataset\.cla"
+    ):
+        test_tool.main()
 
 
 def test_figures_of_a_users_metric_are_written(tmp_path, monkeypatch):

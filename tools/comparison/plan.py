@@ -27,7 +27,7 @@ from gsmap.checkpoints.reading import read_weights
 from gsmap.checkpoints.settings import differences, plain, single_dataset_of
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
-from gsmap.engine.launch import check_config, find_schedulers, read_config
+from gsmap.engine.launch import check_config, find_milestones, find_schedulers, read_config
 from gsmap.engine.targets import class_of_type
 from gsmap.evaluation.core.evaluator import METRIC_NAMES
 from gsmap.evaluation.map_metric import MapMetric
@@ -122,7 +122,7 @@ class Run:
         config: Config file.
         options: All overrides.
         epochs: Number of epochs.
-        iterations: Number of optimizer steps.
+        iterations: Number of training iterations.
         processes: Number of processes that train together.
         settings: All settings that affect the result.
     """
@@ -204,9 +204,9 @@ class Protocol:
 
     Attributes:
         seeds: Number of seeds; the seeds are 0, 1, 2 and so on.
-        budget: Optimizer steps of each run.
+        budget: Training iterations of each run.
         out: Folder of all work folders.
-        batch: Number of samples of a step, over all processes.
+        batch: Number of samples of an iteration, over all processes.
         init: Checkpoint or named model at the start of all runs; None trains from scratch.
         options: Overrides of every config.
     """
@@ -237,7 +237,8 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     Raises:
         FileNotFoundError: If a config, a checkpoint or a data set does not exist.
         ValueError: If names repeat, the budget is not a whole number of epochs, the configs use
-            different data or are equal, or a work folder has other settings.
+            different data, accumulate gradients over different numbers of iterations or are
+            equal, or a work folder has other settings.
     """
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):
@@ -256,6 +257,12 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
             fault=f"{runs[0].label} and {run.label} use different data",
             remedy="Compare configs of one data set, split, range and class list.",
         )
+        # Otherwise, equal numbers of iterations would be different numbers of optimizer steps.
+        _refuse_differences(
+            differences(_accumulation(runs[0]), _accumulation(run)),
+            fault=f"{runs[0].label} and {run.label} have different numbers of optimizer steps",
+            remedy="Set one accumulative_counts for all configs.",
+        )
     # Other seeds need no check, since a seed changes the settings of all configs equally.
     runs_of_first_seed = runs[: len(entries)]
     for one, other in combinations(runs_of_first_seed, 2):
@@ -267,6 +274,12 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     for run in runs:
         _check_folder(run)
     return runs
+
+
+def _accumulation(run: Run) -> dict[str, int]:
+    """Number of iterations of an optimizer step, by the name of its setting."""
+    counts = (run.settings["optim_wrapper"] or {}).get("accumulative_counts", 1)
+    return {"optim_wrapper.accumulative_counts": counts}
 
 
 def _processes(protocol: Protocol) -> int:
@@ -324,10 +337,7 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     epochs = _count_epochs(entry, cfg, protocol=protocol, processes=processes)
     comparison_options.append(f"train_cfg.max_epochs={epochs}")
     comparison_options.append(f"train_cfg.val_interval={max(1, epochs // 4)}")
-    for name, scheduler in find_schedulers(cfg).items():
-        # A cosine schedule over epochs must end with the training.
-        if "T_max" in scheduler and scheduler.get("by_epoch", True):
-            comparison_options.append(f"{name}.T_max={epochs - scheduler.get('begin', 0)}")
+    comparison_options += _schedule_options(cfg, epochs=epochs)
     options = (*comparison_options, *user_options)
     cfg = read_config(entry.config, parse_options(options))
     check_config(cfg)
@@ -364,6 +374,58 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     )
 
 
+def _schedule_options(cfg: Config, epochs: int) -> list[str]:
+    """Overrides that fit the schedules over epochs of a config to another number of epochs.
+
+    A cosine schedule ends with the training. Milestones and the step sizes of ``StepLR`` are scaled
+    in proportion. The epochs before the begin of a schedule stay as they are.
+    """
+    options: list[str] = []
+    for name, scheduler in find_schedulers(cfg).items():
+        if not scheduler.get("by_epoch", True):
+            continue
+        begin = scheduler.get("begin", 0)
+        length = epochs - begin
+        if "T_max" in scheduler:
+            options.append(f"{name}.T_max={length}")
+        old_length = (cfg.train_cfg.get("max_epochs") or epochs) - begin
+        if old_length < 1 or length == old_length:
+            continue
+        milestones = _scale_milestones(
+            find_milestones(scheduler), old_length=old_length, length=length
+        )
+        if milestones:
+            options.append(f"{name}.milestones=[{','.join(map(str, milestones))}]")
+        step_size = scheduler.get("step_size")
+        if isinstance(step_size, int | float):
+            scaled_size = max(1, round(step_size * length / old_length))
+            options.append(f"{name}.step_size={scaled_size}")
+    return options
+
+
+def _scale_milestones(milestones: Sequence[float], old_length: int, length: int) -> list[int]:
+    """Scale milestones to another length of their schedule.
+
+    Args:
+        milestones: Epochs of the schedule.
+        old_length: Number of epochs of the schedule.
+        length: Number of epochs of the result.
+
+    Returns:
+        Different epochs in increasing order, from 1. They lie before the end if the milestones do
+        and the schedule has enough epochs; otherwise `check_config` refuses them.
+    """
+    scaled: list[int] = []
+    for index, milestone in enumerate(sorted(milestones)):
+        epoch = round(milestone * length / old_length)
+        if milestone < old_length:
+            # Each later milestone needs an epoch before the end.
+            epoch = min(epoch, length - len(milestones) + index)
+        earliest = scaled[-1] + 1 if scaled else 1
+        scaled.append(max(epoch, earliest))
+    return scaled
+
+
 def _weights_of(cfg: Config) -> str | None:
     """Digest of the checkpoint that the training starts from, or its address; None without one."""
     source = cfg.get("load_from")
@@ -373,28 +435,28 @@ def _weights_of(cfg: Config) -> str | None:
 
 
 def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int) -> int:
-    """Number of epochs that have the optimizer steps of the budget.
+    """Number of epochs that have the iterations of the budget.
 
     Raises:
-        ValueError: If the budget is not a whole number of epochs, or an epoch has no step.
+        ValueError: If the budget is not a whole number of epochs, or an epoch has no iteration.
     """
-    steps_per_epoch = _count_steps(cfg, processes=processes)
-    if steps_per_epoch == 0:
+    iterations_per_epoch = _count_iterations(cfg, processes=processes)
+    if iterations_per_epoch == 0:
         raise InputError(
             f"an epoch of {entry.name} has no iteration: train_dataloader.drop_last leaves out its "
             f"only batch, of less than {protocol.batch} samples. Give a smaller --batch."
         )
-    epochs = round(protocol.budget / steps_per_epoch) or 1  # at least 1
-    if epochs * steps_per_epoch != protocol.budget:
+    epochs = round(protocol.budget / iterations_per_epoch) or 1  # at least 1
+    if epochs * iterations_per_epoch != protocol.budget:
         raise InputError(
             f"a budget of {protocol.budget} iterations is no whole number of epochs of {entry.name}"
-            f" ({steps_per_epoch} iterations each): give {epochs * steps_per_epoch}."
+            f" ({iterations_per_epoch} iterations each): give {epochs * iterations_per_epoch}."
         )
     return epochs
 
 
-def _count_steps(cfg: Config, processes: int) -> int:
-    """Number of optimizer steps of an epoch, by the data loader of the training."""
+def _count_iterations(cfg: Config, processes: int) -> int:
+    """Number of iterations of an epoch, by the data loader of the training."""
     single_dataset_of(cfg, part="train", purpose="a comparison")  # raises an error for wrappers
     settings = cfg.train_dataloader.to_dict()  # a copy
     settings |= {"num_workers": 0, "persistent_workers": False, "prefetch_factor": None}

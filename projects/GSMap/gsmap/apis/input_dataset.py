@@ -12,6 +12,7 @@ from gsmap.checkpoints.building import building
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.source import Mount, Source, change_frame
+from gsmap.engine.map_agreement import check_map_agreement
 
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
@@ -71,7 +72,9 @@ def open_dataset(
     if source.data_root is not None:
         settings["data_root"] = str(source.data_root.resolve())
     with building(cfg):  # adds the name of the config to errors
-        return DATASETS.build(settings)
+        dataset = DATASETS.build(settings)
+    check_map_agreement(cfg, "test")  # range and classes of the model
+    return dataset
 
 
 def _annotation_meta(

@@ -23,6 +23,7 @@ from mmengine.utils import import_modules_from_strings
 from gsmap.checkpoints.building import reading_config
 from gsmap.checkpoints.named_models import find_config
 from gsmap.checkpoints.settings import innermost_datasets, pipeline_steps, scale_steps
+from gsmap.engine.map_agreement import check_map_agreement
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.engine.targets import check_targets, class_of_type, share_settings
 from gsmap.utils.errors import InputError
@@ -338,9 +339,11 @@ def check_config(cfg: Config, for_training: bool = True) -> None:
     Raises:
         ValueError: If one of these mistakes is found. The training has no epoch, or a setting of a
             loop has a wrong type. The runner or backend does not exist. The sampler of a temporal
-            model does not keep the order of frames. For a training also: The learning-rate schedule
-            ends at another epoch. The optimizer does not exist. The pipeline lacks a transform that
-            the head needs, or settings of this transform contradict the head. The batch size of a
+            model does not keep the order of frames. The range or the classes of the model differ
+            from the test data set. For a training also: They differ from the data set of training
+            or validation. The learning-rate schedule ends at another epoch, or has a milestone
+            after the end. The optimizer does not exist. The pipeline lacks a transform that the
+            head needs, or settings of this transform contradict the head. The batch size of a
             temporal model is not the number of streams. A model with a memory is trained by
             iterations. Checkpoints count epochs in a training by iterations, or the reverse, or are
             written elsewhere.
@@ -348,6 +351,8 @@ def check_config(cfg: Config, for_training: bool = True) -> None:
     _check_lengths(cfg)
     _check_backend(cfg)
     _check_streams(cfg, for_training=for_training)
+    parts = ("train", "val", "test") if for_training else ("test",)
+    check_map_agreement(cfg, *parts)  # range and classes of the model and its data sets
     runner_type = cfg.get("runner_type", "Runner")
     _check_registered(cfg, component="runner", registry=RUNNERS, type_name=runner_type)
     if not for_training:
@@ -397,25 +402,44 @@ def _check_backend(cfg: Config) -> None:
 
 
 def _check_schedule(cfg: Config) -> None:
-    """Require that a cosine schedule and the training end at an equal epoch.
+    """Require that schedules over epochs fit the length of the training.
 
-    ``T_max`` is the number of epochs of a cosine schedule, which starts after ``begin`` epochs.
+    A schedule starts after ``begin`` epochs, and counts its epochs from there. A cosine schedule of
+    ``T_max`` epochs must end with the training, and ``milestones`` must lie before its end.
     """
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     if end is None:
         return
     for name, scheduler in find_schedulers(cfg).items():
-        length = scheduler.get("T_max")
-        if length is None or not scheduler.get("by_epoch", True):
+        if not scheduler.get("by_epoch", True):
             continue
         begin = scheduler.get("begin", 0)
-        if length != end - begin:
+        length = scheduler.get("T_max")
+        if length is not None and length != end - begin:
             start = f" and begins after {begin}" if begin else ""
             raise InputError(
                 f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {length}"
                 f"{start}: set both train_cfg.max_epochs and {name}.T_max, or inherit from a base "
                 "file that sets both."
             )
+        last = max(find_milestones(scheduler), default=0)
+        if last and last >= end - begin:
+            raise InputError(
+                f"{cfg.filename}: training lasts {end} epochs but the last milestone of the "
+                f"schedule comes after {begin + last}: set {name}.milestones to numbers below "
+                f"{end - begin}, or a larger train_cfg.max_epochs."
+            )
+
+
+def find_milestones(scheduler: Mapping[str, Any]) -> list[float]:
+    """Return the milestones of a scheduler, empty if it has none.
+
+    Values of a wrong type are left out, because the scheduler reports them when it is built.
+    """
+    milestones = scheduler.get("milestones")
+    if not isinstance(milestones, list | tuple):
+        return []
+    return [milestone for milestone in milestones if isinstance(milestone, int | float)]
 
 
 def find_schedulers(cfg: Config) -> dict[str, ConfigDict]:

@@ -13,7 +13,7 @@ from mmengine.dist import master_only
 from mmengine.hooks import Hook
 from mmengine.logging import MMLogger
 from mmengine.model import is_model_wrapper
-from mmengine.optim import AmpOptimWrapper
+from mmengine.optim import AmpOptimWrapper, OptimWrapper, OptimWrapperDict
 from mmengine.runner import EpochBasedTrainLoop, Runner
 from torch import nn
 
@@ -121,6 +121,33 @@ class MapRunner(Runner):
                 resume_param_scheduler=resume_param_scheduler,
                 map_location=map_location,
             )
+
+    def scale_lr(self, optim_wrapper: OptimWrapper, auto_scale_lr: dict | None = None) -> None:
+        """Scale the learning rate from the base batch size to the samples of an optimizer step.
+
+        mmengine leaves out that an optimizer step with accumulated gradients has the samples of
+        ``accumulative_counts`` iterations.
+
+        Args:
+            optim_wrapper: Optimizer of the training, or several of them.
+            auto_scale_lr: Settings ``enable`` and ``base_batch_size``; None scales nothing.
+        """
+        wrappers: list[Any] = [optim_wrapper]
+        if isinstance(optim_wrapper, OptimWrapperDict):
+            wrappers = list(optim_wrapper.values())
+        for wrapper in wrappers:
+            settings = dict(auto_scale_lr or {})
+            base_batch_size = settings.get("base_batch_size")
+            iterations = getattr(wrapper, "_accumulative_counts", 1)
+            if settings.get("enable") and base_batch_size and iterations > 1:
+                # rate * (batch * iterations) / base = rate * batch / (base / iterations)
+                settings["base_batch_size"] = float(base_batch_size) / iterations
+                self.logger.info(
+                    f"An optimizer step has the gradients of {iterations} iterations, so its base "
+                    f"batch size of {base_batch_size} is {settings['base_batch_size']:g} per "
+                    "iteration."
+                )
+            super().scale_lr(wrapper, settings)
 
     def call_hook(self, fn_name: str, **kwargs: Any) -> None:
         """Call a method of all hooks, and record in `RankWatch` that this rank begins a step."""
