@@ -446,7 +446,7 @@ def score(passes: list[Pass], ann: AnnotationFile, out: Path) -> None:
         "suppressed": map_figures(baseline, truths, drives),
     }
     print(f"\n{figures_table(figures)}\n")
-    write_text(out / _SCORES, json.dumps(figures, indent=1) + "\n")
+    write_text(out / _SCORES, json.dumps(figures, indent=1, allow_nan=False) + "\n")
     print(f"figures: {out / 'scores.json'}")
 
 

@@ -17,6 +17,7 @@ from drivemaps.lanelets import lane_graph, lane_graph_of
 from drivemaps.merging import merge
 from drivemaps.truth import true_map
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.structures.elements import MapElements
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
@@ -227,7 +228,7 @@ def test_driven_lanes_lie_in_the_middle_of_two_borders(tmp_path) -> None:
     """The vehicle drives 0.6 m left of the middle, over a junction of 20 m without lines."""
     positions = track((0.0, 0.6), (200.0, 0.6))
     borders = borders_of_a_road((90.0, 110.0))
-    found = driven_lanes(positions, borders)
+    found = driven_lanes([positions], borders)
     assert found.outside_m == pytest.approx(0.0)
     for line in found.centerlines:
         np.testing.assert_allclose(line[:, 1], 0.0, atol=1e-9)
@@ -244,11 +245,36 @@ def test_driven_lanes_lie_in_the_middle_of_two_borders(tmp_path) -> None:
         assert lanelet.leftBound[0].x < lanelet.leftBound[-1].x
 
 
+def test_drives_that_are_joined_have_tracks_of_their_own() -> None:
+    """One vehicle drives east; another one comes back beside it, at equal times or later."""
+    borders = borders_of_a_road()
+    elements = MapElements.from_polylines(borders, [1] * len(borders))
+    ways = {"a": track((0.0, 0.0), (100.0, 0.0)), "b": track((104.0, 3.5), (4.0, 3.5))}
+    for later_ns in (0, 10**12):
+        samples = []
+        for scene, positions in ways.items():
+            for number, (x, y) in enumerate(positions):
+                pose = np.eye(4)
+                pose[:2, 3] = x, y
+                time_ns = number * 10**9 + (later_ns if scene == "b" else 0)
+                samples.append(MapSample(f"{scene}{number}", scene, "town", time_ns, [], pose))
+        samples.sort(key=lambda sample: sample.timestamp_ns)
+        frames = [DriveFrame(sample, MapElements.from_polylines()) for sample in samples]
+        drive = Drive("town", CLASSES, (-15.0, 15.0), (-30.0, 30.0), frames)
+        lanes = lane_graph_of(drive, elements)
+        assert lanes.source == "of driven lanes (0 of 200 m are in no lane)"
+        length_m = 0.0
+        for lanelet in lanes.lanelets:
+            assert np.ptp(lanelet.left[:, 1]) < 0.1  # no lanelet leads across the divider
+            length_m += shapely.LineString(lanelet.left).length
+        assert 150 < length_m <= 200  # without the pieces at the nodes
+
+
 def test_a_lane_change_joins_no_lanes(tmp_path) -> None:
     """West on the lane at y = 3.5, then across the divider; the lanes are not connected."""
     positions = track((200.0, 3.5), (120.0, 3.5), (90.0, 0.0), (0.0, 0.0))
     borders = borders_of_a_road()
-    found = driven_lanes(positions, borders)
+    found = driven_lanes([positions], borders)
     assert {np.median(line[:, 1]).round(1) for line in found.centerlines} == {3.5, 0.0}
     lanelets, following = routing(tmp_path / "change.osm", lane_graph(found.centerlines, borders))
     ahead = reached({0}, following)
@@ -268,7 +294,7 @@ def test_a_lane_change_joins_no_lanes(tmp_path) -> None:
     ],
 )
 def test_tracks_without_borders_are_in_no_lane(borders, outside_m) -> None:
-    found = driven_lanes(track((0.0, 0.0), (200.0, 0.0)), borders)
+    found = driven_lanes([track((0.0, 0.0), (200.0, 0.0))], borders)
     assert found.driven_m == pytest.approx(200.0)
     assert found.outside_m == pytest.approx(outside_m, abs=4.0)  # two samples
 
@@ -279,10 +305,10 @@ def test_a_standing_vehicle_and_gaps_of_the_track_are_no_lanes() -> None:
     standing = np.array([50.0, 0.0]) + 0.05 * np.array([[0, 0], [1, 1], [-1, 0], [0, -1]])
     rest = track((50.0, 0.0), (80.0, 0.0))
     later = track((140.0, 0.0), (200.0, 0.0))
-    found = driven_lanes(np.concatenate([start, standing, rest, later]), borders_of_a_road())
+    found = driven_lanes([np.concatenate([start, standing, rest, later])], borders_of_a_road())
     united = shapely.line_merge(shapely.MultiLineString(found.centerlines))
     np.testing.assert_allclose([line.bounds[::2] for line in united.geoms], [[0, 80], [140, 200]])
-    assert not driven_lanes(standing, borders_of_a_road()).centerlines
+    assert not driven_lanes([standing], borders_of_a_road()).centerlines
 
 
 SIDE_STREET = ((60.0, -80.0), (60.0, -22.0), (62.0, -15.0), (66.0, -11.0))
@@ -307,7 +333,7 @@ def test_a_block_driven_twice_has_one_ring_of_lanelets(lead, tmp_path) -> None:
             borders.append(np.array([[x, -80.0], [x, -20.0]]))
     laps = [once[1:], once[1:], once[1:14]]
     positions = [track(*lead, tuple(once[0])), *laps] if lead else [once[:1], *laps]
-    found = driven_lanes(np.concatenate(positions), borders)
+    found = driven_lanes([np.concatenate(positions)], borders)
     assert found.driven_m > 2.1 * ring.length
     lanes = lane_graph(found.centerlines, borders)
     _, following = routing(tmp_path / "block.osm", lanes)
@@ -335,7 +361,9 @@ def test_many_stretches_are_joined_in_linear_time() -> None:
 def test_borders_beside_a_wide_lane_are_too_far_for_its_bounds() -> None:
     """Between kerbs 7 m apart the vehicle keeps to the right, 1.75 m from its kerb."""
     borders = borders_of_a_road()[:3:2]
-    lanes = lane_graph(driven_lanes(track((0.0, 0.0), (200.0, 0.0)), borders).centerlines, borders)
+    lanes = lane_graph(
+        driven_lanes([track((0.0, 0.0), (200.0, 0.0))], borders).centerlines, borders
+    )
     np.testing.assert_allclose(lanes.left[:, 1], 1.75)
     np.testing.assert_allclose(lanes.right[:, 1], -1.75)
 
@@ -348,7 +376,7 @@ def test_driven_lanes_of_minicity_are_its_annotated_lanes(minicity_drive) -> Non
     outside_m = 0.0
     for frame in minicity_drive.frames:
         for path in frame.elements.select(frame.elements.labels == 2).polylines:
-            found = driven_lanes(resample(path), borders)
+            found = driven_lanes([resample(path)], borders)
             driven_m += found.driven_m
             outside_m += found.outside_m
             for centerline in found.centerlines:

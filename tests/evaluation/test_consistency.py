@@ -193,7 +193,10 @@ def test_tracks_are_written_and_read_again(files, tmp_path):
     about = json.loads((tmp_path / "tracks.json").read_text())["meta"]
     assert about == {"trained_on": "official", "classes": list(CONFIG.classes)}
     assert evaluate_drives(tmp_path / "tracks.json", annotations, CONFIG) == figures
-    assert figures["consistency/C-mAP"] == pytest.approx(1 / 3)  # of three classes
+    # Two of three classes have no ground truth, and do not count in the means.
+    assert figures["consistency/C-mAP"] == figures["consistency/mAP"] == pytest.approx(1)
+    assert figures["consistency/num_absent_classes"] == 2
+    assert figures["consistency/CAP@1.0/boundary"] == -1
 
 
 def test_a_missing_sample_and_a_bad_track_are_named(files, tmp_path):
@@ -246,7 +249,7 @@ def test_the_command_scores_drives_and_writes_tracks(files, tmp_path, capsys):
     words = [str(annotations.path), "--eval", "chamfer", "--consistency"]
     evaluate.main([str(results), *words, "--tracks", str(tracks), "--out", str(figures)])
     assert "consistency/C-mAP" in capsys.readouterr().out
-    assert json.loads(figures.read_text())["consistency/C-mAP"] == pytest.approx(1 / 3)
+    assert json.loads(figures.read_text())["consistency/C-mAP"] == pytest.approx(1)
     evaluate.main([str(tracks), *words])
     for metric in ("chamfer", "raster"):
         words[2] = metric

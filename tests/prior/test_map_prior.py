@@ -2,12 +2,14 @@
 
 import math
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from gsmap.prior import HitMissCounts, KeepMaximum, LastSeen, MapPrior, PriorSettings
+from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 
 SETTINGS = PriorSettings(("divider", "boundary", "ped_crossing"), "town")
@@ -205,6 +207,19 @@ def test_threads_lose_nothing():
     assert failures == []
     for x in (0, 60, 120, 180):
         assert bool((prior.read(pose_at(x, 0), GRID) == 1).all())
+
+
+@pytest.mark.parametrize("cell_m", [0.3, 0.6, 1.0, 1.5, 4.0])
+def test_a_line_has_no_gap_whatever_the_size_of_the_cells(cell_m):
+    for phase in (0.0, 0.3, 0.5, 0.7):
+        for direction in ([1.0, 0.0], [1.0, 0.02], [1.0, 0.4], [1.0, 1.0]):
+            prior = MapPrior(replace(SETTINGS, cell_m=cell_m), KeepMaximum())
+            start = np.array([0.1, phase * cell_m])
+            line = np.stack([start, start + 24 * np.array(direction)])
+            prior.write_map(MapElements.from_polylines([line], [0]))
+            grid = BEVGrid((2.0, 22.0), (-15.0, 45.0), height=150, width=50)  # cells of 0.4 m
+            found = prior.read(np.eye(4), grid)[0]  # (rows, columns) of one class
+            assert bool((found > 0).any(dim=0).all())
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])

@@ -73,6 +73,18 @@ def test_poses_that_cannot_be_right_are_named(files, tmp_path, capsys):
         assert is_named == (name == "wrong")
 
 
+def test_scores_of_an_empty_map_are_json_without_nan(files, tmp_path, capsys):
+    _, ann = files
+    nothing = [(token, []) for token in AnnotationFile(ann).column("token")]
+    write_results(tmp_path / "empty.json", nothing)
+    main([str(tmp_path / "empty.json"), "--ann", str(ann), "--out", str(tmp_path)])
+    text = (tmp_path / "scores.json").read_text()
+    scores = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in {text}"))
+    assert scores["merged"]["AP"]["mean"] == 0
+    assert "mean" not in scores["merged"]["accuracy@0.5"]
+    assert "| accuracy@0.5 | merged | - |" in capsys.readouterr().out
+
+
 def test_predictions_of_other_classes_are_left_out_and_counted(files, tmp_path, capsys):
     results, ann = files
     content = json.loads(results.read_text())
@@ -401,7 +413,8 @@ def test_changes_since_an_old_map_are_written(files, tmp_path, capsys):
     capsys.readouterr()
     words = [str(results), "--ann", str(ann), "--out", str(tmp_path), "--origin", "48", "11"]
     main([*words, "--changes", str(tmp_path / "old.geojson")])
-    assert "changes: 1 removed, 2 added, 1 moved: " in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "changes: 1 removed, 2 added, 1 moved; the old map has no ped_crossing at all" in printed
     written = json.loads((tmp_path / "changes.geojson").read_text())
     assert written["crs"] is None
     assert written["generator"] == "gsmap"

@@ -41,6 +41,16 @@ def test_a_drive_has_a_frame_for_each_sample_as_fast_as_it_was(tmp_path):
     assert shorter[0].shape[0] < shown[0].shape[0]  # without cameras
 
 
+def test_pictures_of_equal_times_do_not_make_a_film_faster(tmp_path):
+    """Two drives that are joined, each with a picture at 0, 0.5 and 1 s."""
+    path = tmp_path / "joined.mp4"
+    pictures = [np.full((32, 32, 3), level, np.uint8) for level in range(0, 240, 40)]
+    for times_s, rate in (([0, 0, 0.5, 0.5, 1, 1], 2), ([0] * 6, 2), ([0, 2, 4, 6, 8, 10], 0.5)):
+        film.write_film(path, pictures, [int(time_s * 1e9) for time_s in times_s])
+        with av.open(str(path)) as opened:
+            assert opened.streams.video[0].average_rate == rate
+
+
 def test_an_element_keeps_the_colour_of_its_track(tmp_path):
     annotations, results = write_case(tmp_path)
     found = json.loads(results["good"].read_text())

@@ -78,12 +78,15 @@ class Changes:
             view.
         num_too_small: Number of areas of the old map in view that enclose less than 1 square metre,
             by class name.
+        num_of_absent_classes: Number of added elements of classes of which the old map has no
+            element at all, by class name: it may just not record these classes.
     """
 
     changes: list[Change]
     num_on_new_ground: dict[str, int] = field(default_factory=dict)
     num_not_in_view: dict[str, int] = field(default_factory=dict)
     num_too_small: dict[str, int] = field(default_factory=dict)
+    num_of_absent_classes: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ import numpy as np
 
 from drivemaps.area_changes import MIN_SHARE_IN_VIEW, area_changes
 from drivemaps.change import (
+    ADDED,
     KINDS,
     MIN_VIEWS,
     MOVED,
@@ -112,11 +113,16 @@ def find_changes(
         name = classes[label]
         if name in AREA_CLASSES and not polygons_of([line[:, :2]]):
             num_too_small[name] += 1
+    num_of_absent_classes: Counter[str] = Counter()
+    for change in changes:
+        if change.kind == ADDED and change.label not in whole_map.labels:
+            num_of_absent_classes[classes[change.label]] += 1
     return Changes(
         changes,
         dict(num_on_new_ground),
         num_not_in_view=dict(num_not_in_view),
         num_too_small=dict(num_too_small),
+        num_of_absent_classes=dict(num_of_absent_classes),
     )
 
 
@@ -247,7 +253,8 @@ def summarize_changes(found: Changes) -> str:
 
     Returns:
         One line, such as
-        ``2 removed, 0 added, 1 moved (not compared: 3 divider on new ground)``.
+        ``2 removed, 0 added, 1 moved (not compared: 3 divider on new ground)``. It names the
+        classes of which the old map has no element.
     """
     counts = Counter(change.kind for change in found.changes)
     text = ", ".join(f"{counts[kind]} {kind}" for kind in KINDS)
@@ -265,4 +272,6 @@ def summarize_changes(found: Changes) -> str:
         not_compared.append(f"{', '.join(numbers)} {reason}")
     if not_compared:
         text += f" (not compared: {'; '.join(not_compared)})"
+    for name, count in sorted(found.num_of_absent_classes.items()):
+        text += f"; the old map has no {name} at all, so {count} {name} count as added"
     return text

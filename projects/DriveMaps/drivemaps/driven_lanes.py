@@ -1,7 +1,7 @@
 """Centre lines of the lanes that a vehicle has driven, computed from dividers and boundaries."""
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -54,7 +54,9 @@ class DrivenLanes(NamedTuple):
     outside_m: float
 
 
-def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLanes:
+def driven_lanes(
+    positions_of_drives: Iterable[FloatArray], borders: list[FloatArray]
+) -> DrivenLanes:
     """Find the lanes along the track of a vehicle.
 
     A lane lies between the nearest border on the left of the vehicle and the nearest one on the
@@ -64,7 +66,8 @@ def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLane
     stretch of at most 50 m without borders, such as a junction, joins the lanes before and after.
 
     Args:
-        positions: Positions of the vehicle in the order of time, in metres. (n, 2)
+        positions_of_drives: Positions of the vehicle in each drive, in the order of time, in
+            metres. (n, 2) each
         borders: Dividers and boundaries, in metres. each (m, 2)
 
     Returns:
@@ -72,7 +75,9 @@ def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLane
         A lane that is driven twice has one centre line.
     """
     tree = border_tree(borders)
-    lanes = [_lane_along(track, tree) for track in _tracks(positions)]
+    lanes = []
+    for positions in positions_of_drives:
+        lanes += [_lane_along(track, tree) for track in _tracks(positions)]
     if not lanes:
         return DrivenLanes([], driven_m=0.0, outside_m=0.0)
     earlier_points = _earlier_points(lanes)

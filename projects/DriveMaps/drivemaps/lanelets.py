@@ -93,8 +93,11 @@ def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
         borders += _lines_of_class(drive, elements, name)
     lines = _lines_of_class(drive, elements, CENTERLINE)
     if not lines:
-        positions = np.array([frame.origin for frame in drive.frames])
-        lanes = driven_lanes(positions, borders)
+        # Vehicles of several drives do not follow each other.
+        positions_of_scene: dict[str, list[FloatArray]] = {}
+        for frame in drive.frames:
+            positions_of_scene.setdefault(frame.sample.scene, []).append(frame.origin)
+        lanes = driven_lanes(map(np.array, positions_of_scene.values()), borders)
         source = f"of driven lanes ({lanes.outside_m:.0f} of {lanes.driven_m:.0f} m are in no lane)"
         return replace(lane_graph(lanes.centerlines, borders), source=source)
     directed_lines: list[FloatArray] = []

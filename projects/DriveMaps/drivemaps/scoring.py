@@ -29,8 +29,8 @@ def chamfer_ap(
         num_points: Number of points that each line is resampled to.
 
     Returns:
-        AP in [0, 1] of each class that has ground truth, and their ``mean``. The mean is NaN if no
-        class has ground truth.
+        AP in [0, 1] of each class that has ground truth, and their ``mean``; empty if no class
+        has ground truth.
     """
     evaluator = MapEvaluator(ChamferConfig(tuple(classes), num_points=num_points))
     matches = []
@@ -46,9 +46,10 @@ def chamfer_ap(
 
 
 def _with_mean(value_of_class: dict[str, float]) -> dict[str, float]:
-    """Add the mean of all classes. Without classes, the mean is NaN."""
-    mean = float(np.mean(list(value_of_class.values()))) if value_of_class else np.nan
-    return value_of_class | {"mean": mean}
+    """Add the mean of all classes. Without classes, there is none."""
+    if not value_of_class:
+        return {}
+    return value_of_class | {"mean": float(np.mean(list(value_of_class.values())))}
 
 
 def near_and_total_m(
@@ -112,7 +113,7 @@ def map_figures(
 
     Returns:
         Values in [0, 1] by figure, then by class or ``mean``; a class without a value is left out,
-        and a mean without classes is NaN. ``AP`` is the AP of whole elements.
+        and without classes there is no mean. ``AP`` is the AP of whole elements.
         ``AP per sample`` is the AP of the maps cut to the range of each sample.
         ``completeness@T`` is the share of the true length within T metres of the predicted map.
         ``accuracy@T`` is the share of the predicted length within T metres of the true map. Both

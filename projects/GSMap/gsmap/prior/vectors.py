@@ -21,6 +21,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed
 from gsmap.utils.errors import InputError
 
+_LEAST_CELLS = 1.01  # width of a line in cells
 _MOST_PIECES = 1_000_000  # largest number of pieces of lines and areas, in all tiles together
 _CHUNK = 64  # pieces of a tile that are drawn at a time, which bounds the memory
 Piece = tuple[int, bool, FloatArray]
@@ -38,7 +39,7 @@ def covered_cells(
     Args:
         elements: Map in the global frame, in metres.
         settings: Classes, cells and tiles of the prior.
-        width_m: Width of a line in metres, > 0.
+        width_m: Width of a line in metres, > 0; at least a little more than a cell is used.
 
     Returns:
         Column and row of each tile, and whether an element of each of the C classes covers each
@@ -53,6 +54,8 @@ def covered_cells(
         raise InputError(f"labels of elements must be in [0, {num_classes}), the prior's classes.")
     if np.abs(elements.points[:, :2]).max(initial=0.0) > FARTHEST_M:
         raise InputError(f"vertices must be within {FARTHEST_M:g} m of the origin.")
+    # A line that is narrower than a cell would cover less than half of each cell.
+    width_m = max(width_m, _LEAST_CELLS * settings.cell_m)
     pieces_of_tile = _pieces_by_tile(elements, settings=settings, width_m=width_m)
     side = settings.tile_cells
     extent = (0.0, settings.tile_m)

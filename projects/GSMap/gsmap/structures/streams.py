@@ -9,6 +9,7 @@ A frame is one sample of a drive. The word is also used for coordinate systems, 
 frame", the coordinate system of the map elements of a sample.
 """
 
+import logging
 import operator
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,15 @@ from numpy.typing import NDArray
 
 from gsmap.structures.rigid import invert_rigid, is_rigid
 from gsmap.utils.errors import InputError, InputTypeError
+
+_LOGGER = logging.getLogger(__name__)
+_MANY_GAPS = 20  # so many frames after a gap, and none without one, are named
+# Placeholders: number of frames, seconds of the latest gap, and of the longest allowed one.
+_NO_MEMORY = (
+    "the model has no memory of earlier frames: %d frames came %.3f s after the frame before, and "
+    "streams go on after more than 0 and up to %g s (temporal.max_gap_s). Give samples their times "
+    "(timestamp_ns, in nanoseconds) and scenes, or set a longer gap."
+)
 
 
 @dataclass(frozen=True)
@@ -111,7 +121,35 @@ class StreamState:
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Slots:
+class _Gaps:
+    """Rule by which a frame continues the stream of its scene.
+
+    A warning is logged if many frames come after a gap, and none continues a stream.
+
+    Args:
+        max_gap_s: Longest time between two frames of a stream in seconds.
+    """
+
+    def __init__(self, max_gap_s: float) -> None:
+        self.max_gap_s = max_gap_s
+        self._num_gaps = 0
+        self._has_continued = False
+
+    def _is_near(self, seconds: float) -> bool:
+        """Whether a frame continues the stream of its scene, whose last frame was before.
+
+        Args:
+            seconds: Time since the last frame of the scene.
+        """
+        is_near = 0 < seconds <= self.max_gap_s
+        self._has_continued |= is_near
+        self._num_gaps += not is_near
+        if self._num_gaps == _MANY_GAPS and not self._has_continued and not is_near:
+            _LOGGER.warning(_NO_MEMORY, self._num_gaps, seconds, self.max_gap_s)
+        return is_near
+
+
+class Slots(_Gaps):
     """Streams by their index in the batch, for training.
 
     A sampler supplies each index with consecutive samples. A sample that does not follow the
@@ -123,7 +161,7 @@ class Slots:
     """
 
     def __init__(self, max_gap_s: float) -> None:
-        self.max_gap_s = max_gap_s
+        super().__init__(max_gap_s)
         self.states: list[StreamState] = []
 
     def previous(self, frames: Sequence[Frame]) -> list[StreamState | None]:
@@ -147,14 +185,14 @@ class Slots:
         """Whether a frame continues the stream of a state."""
         if frame.scene != state.frame.scene:
             return False
-        return 0 < frame.seconds_after(state.frame) <= self.max_gap_s
+        return self._is_near(frame.seconds_after(state.frame))
 
     def keep(self, states: Sequence[StreamState]) -> None:
         """Store the states after the frames of a batch, in the order of the batch."""
         self.states = list(states)
 
 
-class Scenes:
+class Scenes(_Gaps):
     """Streams by the name of their scene, for testing. Frames of a scene must come in order.
 
     The streams are bound to one model (`claim`), since another model cannot read its memory. A
@@ -173,7 +211,7 @@ class Scenes:
     """
 
     def __init__(self, max_gap_s: float, max_streams: int = 16) -> None:
-        self.max_gap_s = max_gap_s
+        super().__init__(max_gap_s)
         self.max_streams = max_streams
         self.states: OrderedDict[str, StreamState] = OrderedDict()
         self.owner: object = None
@@ -244,7 +282,7 @@ class Scenes:
                 f"frame {frame} {fault}: its stream is at {state.frame} already. Hand a stream its "
                 "frames once each and in order, or start a new stream."
             )
-        return state if seconds <= self.max_gap_s else None
+        return state if self._is_near(seconds) else None
 
     def keep(self, states: Sequence[StreamState]) -> None:
         """Store the states after the frames of a batch."""

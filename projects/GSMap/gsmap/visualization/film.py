@@ -35,9 +35,11 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
         RuntimeError: If ``av`` (PyAV) is missing.
     """
     av = import_extra("av", "viz")
-    # The film has a constant rate, from the median period of the pictures. One picture alone is
-    # shown for half a second.
-    period_s = np.median(np.diff(times_ns)) / 1e9 if len(times_ns) > 1 else 0.5
+    # The film has a constant rate, from the median period of the pictures. One picture alone, or
+    # pictures of one time, are shown for half a second each.
+    periods_ns = np.diff(times_ns)
+    periods_ns = periods_ns[periods_ns > 0]  # drives that are joined may have equal times
+    period_s = np.median(periods_ns) / 1e9 if len(periods_ns) else 0.5
     period_s = np.clip(period_s, 1 / 60, 10)
     rate = Fraction(1 / period_s).limit_denominator(100)  # pictures per second
     with atomic_write(path, "wb") as file, av.open(file, "w", format="mp4") as film:

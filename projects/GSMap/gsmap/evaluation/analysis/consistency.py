@@ -20,6 +20,7 @@ from scipy.optimize import linear_sum_assignment
 from gsmap.evaluation.core import chamfer_kernels as kernels
 from gsmap.evaluation.core.average_precision import area_ap
 from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, checked_thresholds
+from gsmap.evaluation.core.report import UNDEFINED
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import resample_all
@@ -502,9 +503,10 @@ def consistency(frames: Iterable[DriveFrame], config: ConsistencyConfig) -> dict
 
     Returns:
         Figures by ``consistency/CAP@0.5/<class>`` and ``consistency/AP@0.5/<class>`` for each
-        threshold and class, ``consistency/C-mAP``, ``consistency/mAP`` and
-        ``consistency/jitter_m``. APs are in [0, 1]. The jitter is in metres, or -1 if no track has
-        lines in two consecutive frames.
+        threshold and class, ``consistency/C-mAP``, ``consistency/mAP``,
+        ``consistency/num_absent_classes`` and ``consistency/jitter_m``. APs are in [0, 1], or -1
+        for a class without ground truth, which does not count in the means. The jitter is in
+        metres, or -1 if no track has lines in two consecutive frames.
     """
     scenes = group_by_scene(frames)
     scene_hits = []  # for each scene and class, the list of `FrameHits`
@@ -527,9 +529,12 @@ def consistency(frames: Iterable[DriveFrame], config: ConsistencyConfig) -> dict
                     consistent=kind == "CAP",
                 )
                 figures[f"consistency/{kind}@{threshold}/{name}"] = ap
-                aps.append(ap)
-    figures["consistency/C-mAP"] = float(np.mean(all_aps["CAP"]))
-    figures["consistency/mAP"] = float(np.mean(all_aps["AP"]))
+                if ap != UNDEFINED:
+                    aps.append(ap)
+    for key, kind in (("C-mAP", "CAP"), ("mAP", "AP")):
+        # Without ground truth of any class, both are 0, as AP_chamfer is.
+        figures[f"consistency/{key}"] = float(np.mean(all_aps[kind] or [0.0]))
+    figures["consistency/num_absent_classes"] = float((totals == 0).sum())
     jitters = [np.empty(0)]  # an array to concatenate even if there is no scene
     for scene in scenes:
         jitters.append(jitter(scene, tracks_of(scene, config), grid=config.grid))
@@ -548,7 +553,12 @@ def _average_precision(
         num_gts: Number of ground truths of the class.
         threshold: Largest Chamfer distance of a match, in metres.
         consistent: Whether matches must continue the tracks of earlier frames.
+
+    Returns:
+        AP in [0, 1]; -1 without ground truths.
     """
+    if num_gts == 0:
+        return UNDEFINED
     hits = [np.empty(0, dtype=bool)]
     scores = [np.empty(0)]
     for scene in scenes:
