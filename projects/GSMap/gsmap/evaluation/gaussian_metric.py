@@ -7,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from mmdet3d.registry import METRICS
-from mmengine.evaluator import BaseMetric
 from mmengine.logging import print_log
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from gsmap.evaluation.gathered_metric import GatheredMetric
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.ops.soft_iou import pairwise_soft_iou
@@ -26,7 +26,7 @@ LINE_WIDTH_M = 0.75  # width of a ground-truth line in its mask
 
 
 @METRICS.register_module()
-class GaussianMetric(BaseMetric):
+class GaussianMetric(GatheredMetric):
     """Metric of the soft IoU of predicted and true masks, and of the sizes of the Gaussians.
 
     Predictions of a class are assigned to its ground truths by the soft IoU of their masks. Only

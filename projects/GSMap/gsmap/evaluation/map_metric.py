@@ -1,15 +1,11 @@
 """Metric of the MMEngine runner, a thin wrapper around `MapEvaluator`."""
 
 import logging
-import sys
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from itertools import chain
 from typing import Any
 
 from mmdet3d.registry import METRICS
-from mmengine.dist import all_gather_object
-from mmengine.evaluator import BaseMetric
 from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
@@ -18,6 +14,7 @@ from gsmap.evaluation.core.evaluator import METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.core.metric import MetricSettings, metric_class, metric_names
 from gsmap.evaluation.core.report import flat_metrics, format_table
 from gsmap.evaluation.core.results_json import vectors_of, write_results
+from gsmap.evaluation.gathered_metric import GatheredMetric
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
@@ -25,7 +22,7 @@ from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
 
 
 @METRICS.register_module()
-class MapMetric(BaseMetric):
+class MapMetric(GatheredMetric):
     """AP_chamfer and AP_raster of predicted map elements.
 
     Samples are matched as soon as they are predicted; only the matches are stored and collected
@@ -38,7 +35,7 @@ class MapMetric(BaseMetric):
             ``out_file`` is given.
         thresholds: Largest Chamfer distances of a match, in metres.
         out_file: Path at which predictions are written in MapTR's JSON form, or None.
-        **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
+        **kwargs: ``prefix`` of ``BaseMetric``.
 
     Raises:
         ValueError: If a metric is unknown, a threshold is no number > 0, or neither a metric nor
@@ -124,14 +121,8 @@ class MapMetric(BaseMetric):
 
         Only the first rank computes. The others receive its figures.
         """
-        self._size = size
-        # `BaseMetric` would cut the records of all ranks to the length of the shortest rank, but
-        # ranks that predict whole drives have different numbers of records.
-        parts: list[list[dict[str, Any]]] = all_gather_object(self.results)  # type: ignore[has-type]
-        self.results = list(chain.from_iterable(parts))
-        # `BaseMetric` collects the joined lists again, and would cut them at `size`. Nothing may be
-        # cut here, because `compute_metrics` finds repeated samples by their tokens.
-        return super().evaluate(sys.maxsize)
+        self._size = size  # `compute_metrics` compares it with the number of different samples
+        return super().evaluate(size)
 
     def compute_metrics(self, results: list[dict[str, Any]]) -> dict[str, float]:
         """Compute the figures, log the tables and write the file, on the first rank.
