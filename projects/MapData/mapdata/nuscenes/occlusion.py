@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import CameraRecord, MapSample
+from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapSample
+from gsmap.structures.frames import FrameView, frame_view
 from gsmap.structures.polylines import arc_lengths, resample
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.cli import output_file
@@ -109,10 +110,24 @@ def cuts_sight(origin: Array, points: Array, boxes: Boxes) -> NDArray[np.bool_]:
     return is_line_in_box & is_between_ends
 
 
-def _map_points(sample: MapSample) -> Array:
+def ground_view(meta: AnnotationMeta) -> FrameView:
+    """Create the view of an annotation file, with the ground of vehicles in nuScenes tables.
+
+    The origin of these vehicles' frame is on the road, so the ground is at z = 0 of this frame.
+
+    Args:
+        meta: Metadata of the annotation file.
+    """
+    ground_z_m = meta.ground_z_m
+    if ground_z_m is None and meta.frame == "ego":
+        ground_z_m = 0.0
+    return frame_view(meta.frame, ground_z_m)
+
+
+def _map_points(sample: MapSample, view: FrameView) -> Array:
     """Points along the map elements of a sample, about a metre apart, in its frame. (n, 3)
 
-    Elements without heights are placed on the ground.
+    Elements without heights are placed on the ground. A tilt of the sensor is respected.
 
     Raises:
         ValueError: If the sample has no ground truth.
@@ -121,17 +136,13 @@ def _map_points(sample: MapSample) -> Array:
         raise InputError(
             f"sample {sample.token!r} has no ground truth: give a file with map elements."
         )
-    # The ground is at z = 0 of the vehicle's frame. Without `ego_from_frame`, the annotation frame
-    # is taken to be the vehicle's frame.
-    frame_height_m = 0.0 if sample.ego_from_frame is None else sample.ego_from_frame[2, 3]
+    mounted_view = view.with_mounting(sample.ego_from_frame)
     elements = [np.empty((0, 3))]
     for instance in sample.instances:
         length_m = arc_lengths(instance.points)[-1]
         num_steps = max(math.ceil(length_m / _STEP_M), 1)
         points = resample(instance.points, num_steps + 1)
-        ground_z_m = np.full(len(points), -frame_height_m)
-        # Points with heights have three columns, and the fourth column, the ground, is dropped.
-        elements.append(np.column_stack([points, ground_z_m])[:, :3])
+        elements.append(mounted_view.lift(points))  # points with heights keep them
     return np.concatenate(elements)
 
 
@@ -149,7 +160,7 @@ def _in_image(points: Array, camera: CameraRecord) -> NDArray[np.bool_]:
     return inside & (depth > _NEAR_M)
 
 
-def hidden_share(sample: MapSample, boxes: Boxes) -> float:
+def hidden_share(sample: MapSample, boxes: Boxes, view: FrameView) -> float:
     """Compute the share of a sample's map that boxes hide.
 
     Only map points inside at least one image are counted. A point is hidden if, for each camera
@@ -159,6 +170,7 @@ def hidden_share(sample: MapSample, boxes: Boxes) -> float:
         sample: Sample with cameras and ground truth. Elements without heights are placed on the
             ground.
         boxes: Boxes around the sample.
+        view: View of the annotation frame (`ground_view`), which has the ground plane.
 
     Returns:
         Share in [0, 1]; 0 if no map point is inside an image.
@@ -166,7 +178,7 @@ def hidden_share(sample: MapSample, boxes: Boxes) -> float:
     Raises:
         ValueError: If the sample has no ground truth.
     """
-    points = _map_points(sample)
+    points = _map_points(sample, view)
     global_from_frame = sample.global_from_frame
     global_points = points @ global_from_frame[:3, :3].T + global_from_frame[:3, 3]
     is_in_image = np.zeros(len(points), dtype=bool)
@@ -234,9 +246,10 @@ def run(arguments: argparse.Namespace) -> str:
         raise InputError(f"--limits must rise between 0 and 100, got {limits}.")
     file = AnnotationFile(arguments.annotations)
     boxes = read_boxes(arguments.tables, file.column("token"))
+    view = ground_view(file.meta)
     groups = {}
     for sample in file:
-        share = hidden_share(sample, boxes[sample.token])
+        share = hidden_share(sample, boxes[sample.token], view=view)
         groups[sample.token] = word_for(share, limits)
     write_text(arguments.target, json.dumps(groups, indent=0) + "\n")
     sizes = sorted(Counter(groups.values()).items())
