@@ -137,6 +137,17 @@ def test_the_auxiliary_bev_mask_is_as_large_as_the_bev_features(path):
         assert tuple(steps["MakeBEVMask"].size) == (cells.height, cells.width)
 
 
+@names
+def test_loaded_points_are_transformed_to_the_annotation_frame(path):
+    """Annotation files may be in another frame than the LiDAR (``--frame ego``)."""
+    cfg = load(path)
+    for part in ("train", "val", "test"):
+        steps = [step.type for step in cfg[f"{part}_dataloader"].dataset.pipeline]
+        if "LoadLidarPoints" in steps:
+            assert steps[steps.index("LoadLidarPoints") + 1] == "PointsToFrame"
+            assert steps.count("PointsToFrame") == 1
+
+
 @pytest.mark.parametrize("path", SWAPPABLE, ids=lambda path: path.stem)
 def test_one_word_makes_a_gsmap_of_any_config(path):
     cfg, swapped = load(path), load(path)

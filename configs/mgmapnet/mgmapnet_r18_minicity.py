@@ -19,4 +19,4 @@ model = dict(
             layer=dict(num_heads=4, ffn_dims=256, dropout=0.0, cross_attn=dict(ffn_dims=512))),
         masks=dict(pixel_m=0.625)))
 _mask = dict(type='MakeBEVMask', size=(48, 24), num_classes=3)
-train_dataloader = dict(dataset=dict(pipeline=[*_base_._depth_seg[:6], _mask, *_base_._depth_seg[7:]]))
+train_dataloader = dict(dataset=dict(pipeline=[*_base_._depth_seg[:7], _mask, *_base_._depth_seg[8:]]))

@@ -39,18 +39,18 @@ test_dataloader = val_dataloader
 # Pipelines for leaves to choose. Some methods learn from BEV and camera masks besides map elements, some from
 # LiDAR depth too.
 _points = dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5)
+_to_frame = dict(type='PointsToFrame')  # changes nothing in the frame of the LiDAR
 _masks = [
     dict(type='MakeBEVMask', size=(50, 25), thickness_px=1, num_classes=3),
     dict(type='MakePVMask', stride=8, num_classes=3),
 ]
 _seg = [_load, _scale, _photometric, _targets, *_masks, _pack]
 _depth_seg = [
-    _load, _points, _scale, _photometric, _targets,
+    _load, _points, _to_frame, _scale, _photometric, _targets,
     dict(type='MakeDepthMap'),
     *_masks,
     dict(type='PackMapInputs', with_points=False),
 ]
 # Models with LiDAR see the points of the key frame.
-_to_frame = dict(type='PointsToFrame')
 _lidar = [_load, _points, _to_frame, _scale, _photometric, _targets, _pack]
 _lidar_test = [_load, _points, _to_frame, _scale, _pack]

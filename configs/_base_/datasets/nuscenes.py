@@ -39,13 +39,14 @@ test_dataloader = val_dataloader
 # Pipelines for leaves to choose. Some methods learn from BEV and camera masks besides map elements, some from
 # LiDAR depth too.
 _points = dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5)
+_to_frame = dict(type='PointsToFrame')  # changes nothing in the frame of the LiDAR
 _masks = [
     dict(type='MakeBEVMask', size=(200, 100), num_classes=3),
     dict(type='MakePVMask', stride=32, num_classes=3),
 ]
 _seg = [_load, _scale, _photometric, _targets, *_masks, _pack]
 _depth_seg = [
-    _load, _points, _scale, _photometric, _targets,
+    _load, _points, _to_frame, _scale, _photometric, _targets,
     dict(type='MakeDepthMap'),
     *_masks,
     dict(type='PackMapInputs', with_points=False),
@@ -53,5 +54,5 @@ _depth_seg = [
 # Models with LiDAR see ten sweeps.
 _sweeps = dict(
     type='LoadLidarSweeps', sweeps_num=9, use_dim=[0, 1, 2, 3, 4], pad_empty_sweeps=True, remove_close=True)
-_lidar = [_load_bytes, _points, _sweeps, _photometric, _scale, _targets, _pack]
-_lidar_test = [_load, _points, dict(_sweeps, test_mode=True), _scale, _pack]
+_lidar = [_load_bytes, _points, _to_frame, _sweeps, _photometric, _scale, _targets, _pack]
+_lidar_test = [_load, _points, _to_frame, dict(_sweeps, test_mode=True), _scale, _pack]

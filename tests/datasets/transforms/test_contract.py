@@ -50,6 +50,7 @@ class Case:
         broken: Changed results with which the transform reports a broken sample.
         in_place: Keys with arrays that the transform of a library, from which ours inherits,
             changes in place.
+        given: Entries of the results that replace those of `results_of`.
     """
 
     settings: dict[str, Any] = field(default_factory=dict)
@@ -58,6 +59,7 @@ class Case:
     needs_truth: bool = False
     broken: dict[str, Any] = field(default_factory=dict)
     in_place: set[str] = field(default_factory=set)
+    given: dict[str, Any] = field(default_factory=dict)
 
 
 GONE = {"CAM_FRONT": {"img_path": "FOLDER/gone.jpg", "cam2img": np.eye(4), "lidar2cam": np.eye(4)}}
@@ -100,7 +102,7 @@ CASES: dict[str, dict[str, Case]] = {
             in_place={"points"},
         )
     },
-    "PointsToFrame": {"": Case(changes={"points"})},
+    "PointsToFrame": {"": Case(changes={"points", "lidar2frame"}, given={"lidar2frame": pose(6)})},
     "PackMapInputs": {
         "": Case(
             adds={"inputs", "data_samples"},
@@ -177,7 +179,7 @@ def results_of(folder: Path, truth: list[MapInstance]) -> dict[str, Any]:
         "x_range": (-15.0, 15.0),
         "y_range": (-30.0, 30.0),
         "lidar2ego": pose(5),
-        "lidar2frame": pose(6),
+        "lidar2frame": np.eye(4),
         "timestamp": 1.0,
         "lidar_points": sweep,
         "lidar_sweeps": [{"timestamp": 0.5, "lidar_points": {**sweep, "lidar2sensor": pose(2)}}],
@@ -214,7 +216,7 @@ class Asked:
         """
         torch.manual_seed(0)
         np.random.seed(0)  # noqa: NPY002 - of transforms
-        results = results_of(self.folder, elements() if truth is None else truth)
+        results = results_of(self.folder, elements() if truth is None else truth) | self.case.given
         return {key: value for key, value in results.items() if key not in self.case.adds}
 
     def found(self, results: dict[str, Any], transform: Any = None) -> dict[str, Any]:

@@ -15,19 +15,25 @@ from mmdet3d.structures import LiDARPoints
 from mmengine.config import Config
 from mmengine.registry import init_default_scope
 from pyarrow import feather
+from scipy.spatial.transform import Rotation
 
 import gsmap.registered  # noqa: F401
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.transforms.images import CropImages, ScaleImages
+from gsmap.datasets.transforms.packing import PackMapInputs
 from gsmap.datasets.transforms.points import (
     LoadLidarPoints,
     LoadLidarSweeps,
     MakeDepthMap,
+    PointsToFrame,
     read_points,
 )
+from gsmap.structures.rigid import rigid
+from gsmap.utils.errors import InputError
 from mapdata.argoverse2.convert import convert_argoverse2
 from mapdata.argoverse2.log import RING_CAMERAS
 from mapdata.argoverse2.samples import Argoverse2Options
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 REPO = Path(__file__).resolve().parents[3]
 CONFIG = next(iter(cases_of_methods("ARGOVERSE2_DEPTH").values()), "")
@@ -163,6 +169,88 @@ def test_depths_fill_a_resized_or_cropped_image_and_not_its_padding(steps, pixel
     depths = MakeDepthMap().transform(results)["gt_depth"]
     assert depths[0][pixel] == 5
     assert depths.sum() == 5
+
+
+def in_lidar_frame(frame_from_lidar: np.ndarray) -> dict:
+    """Return results with two points in the frame of the LiDAR, and no earlier sweep."""
+    points = torch.tensor([[2.0, 9.0, 20.0, 1, 0], [3.0, 9.0, 30.0, 1, 0]])
+    return {
+        "token": "a",
+        "points": LiDARPoints(points, points_dim=5),
+        "lidar2frame": frame_from_lidar,
+        "lidar_sweeps": [],
+        "timestamp": 1.0,
+        "img_shape": (32, 32),
+        "raw_shapes": [(32, 32)],
+        "lidar2img": [np.eye(4)],
+    }
+
+
+QUARTER_TURN = rigid(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [0, 0, 0])
+NEED_THE_FRAME = [
+    MakeDepthMap(),
+    LoadLidarSweeps(sweeps_num=1, use_dim=list(range(5))),
+    PackMapInputs(),
+]
+
+
+@pytest.mark.parametrize("step", NEED_THE_FRAME, ids=lambda step: type(step).__name__)
+@pytest.mark.parametrize(
+    "frame_from_lidar",
+    [
+        QUARTER_TURN,
+        rigid(np.eye(3), [0.94, 0, 1.84]),
+        rigid(Rotation.from_euler("x", 0.1, degrees=True).as_matrix(), [0, 0, 0]),
+        rigid(np.eye(3), [0, 0, 1e-3]),
+    ],
+)
+def test_points_of_another_frame_are_refused(step, frame_from_lidar):
+    message = rf"sample 'a': {type(step).__name__} needs points in the annotation .*PointsToFrame"
+    with pytest.raises(InputError, match=message):
+        step.transform(in_lidar_frame(frame_from_lidar))
+    step.transform(PointsToFrame().transform(in_lidar_frame(frame_from_lidar)))
+    step.transform(in_lidar_frame(np.eye(4) + 1e-9))  # rounded
+
+
+def test_points_that_the_model_does_not_receive_are_not_checked():
+    packed = PackMapInputs(with_points=False).transform(in_lidar_frame(QUARTER_TURN))
+    assert "points" not in packed["inputs"]
+
+
+def test_points_are_transformed_to_the_frame_once():
+    results = PointsToFrame().transform(in_lidar_frame(QUARTER_TURN))
+    expected = torch.tensor([[-9.0, 2, 20], [-9, 3, 30]])
+    for _ in range(2):
+        torch.testing.assert_close(results["points"].tensor[:, :3], expected)
+        results = PointsToFrame().transform(results)
+
+
+@pytest.mark.parametrize("base", ["nuscenes", "minicity"])
+def test_depths_do_not_depend_on_the_annotation_frame(base, minicity_root, tmp_path):
+    """The pipelines of the base configs, with files in the frames of LiDAR and vehicle."""
+    init_default_scope("mmdet3d")
+    config = Config.fromfile(REPO / f"configs/_base_/datasets/{base}.py")
+    steps = [step for step in config._depth_seg if "Mask" not in step.type]
+    steps = [step for step in steps if step.type not in ("DistortImages", "FormatMapTargets")]
+    depths = {}
+    for frame in ("lidar", "ego"):
+        options = NuScenesOptions(
+            minicity_root, "v1.0-trainval", dataset="own", frame=frame, out_dir=tmp_path / frame
+        )
+        convert_nuscenes(options)
+        dataset = {
+            "type": "VectorizedMapDataset",
+            "data_root": str(minicity_root),
+            "ann_file": str(options.path_of("own", "train")),
+            "frame": frame,
+            "test_mode": True,
+            "pipeline": steps,
+        }
+        depths[frame] = DATASETS.build(dataset)[0]["data_samples"].gt_depth
+    # Points at the border of two pixels may be rounded to either.
+    differs = (depths["lidar"] - depths["ego"]).abs() > 1e-3
+    assert (depths["lidar"] > 0).sum() > 1000
+    assert differs.sum() < 0.01 * (depths["lidar"] > 0).sum()
 
 
 def test_a_sample_without_lidar_is_named():

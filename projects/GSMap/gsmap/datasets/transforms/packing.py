@@ -12,6 +12,7 @@ from mmdet3d.structures import Det3DDataSample
 from numpy.typing import NDArray
 
 from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.transforms.points import check_points_in_frame
 
 # Entries of the results that become metainfo, as far as a pipeline has them.
 META_KEYS = (
@@ -53,11 +54,13 @@ class PackMapInputs(BaseTransform):
 
         Raises:
             BrokenSampleError: If an image has values that are NaN or infinite.
+            ValueError: If the model receives points that are not in the annotation frame.
         """
         inputs = {}
         if "img" in results:
             inputs["img"] = self._images(results)
         if self.with_points and "points" in results:
+            check_points_in_frame(results, "PackMapInputs")
             inputs["points"] = results["points"].tensor
         sample = Det3DDataSample()
         for key in TARGET_KEYS:

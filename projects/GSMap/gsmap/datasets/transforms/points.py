@@ -22,6 +22,9 @@ from gsmap.utils.inputs import check_input
 # Columns of Argoverse 2. The first five have the meaning of the five values of a point in files of
 # nuScenes.
 FEATHER_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
+# Largest difference from the identity of a transform without effect, such as one that was rounded.
+# It moves a point at a distance of 100 m by a millimetre.
+_FRAME_TOLERANCE = 1e-5
 
 
 def read_points(path: str, load_dim: int) -> np.ndarray:
@@ -97,6 +100,23 @@ def _name_sample_in_errors(
         raise BrokenSampleError(f"sample {results['token']!r}: {error}") from error
 
 
+def check_points_in_frame(results: dict[str, Any], step: str) -> None:
+    """Raise a ``ValueError`` if the points are not in the annotation frame yet.
+
+    Args:
+        results: Results of the earlier transforms.
+        step: Name of the transform that needs the points in the annotation frame, for the message.
+    """
+    remaining = results.get("lidar2frame")
+    if remaining is None or np.allclose(remaining, np.eye(4), rtol=0, atol=_FRAME_TOLERANCE):
+        return
+    raise InputError(
+        f"sample {results['token']!r}: {step} needs points in the annotation frame, and they are "
+        "in another frame, that of the LiDAR: add dict(type='PointsToFrame') to the pipeline, "
+        "directly after LoadLidarPoints."
+    )
+
+
 @TRANSFORMS.register_module()
 class LoadLidarPoints(LoadPointsFromFile):
     """``LoadPointsFromFile`` of mmdet3d with checks and support for files of Argoverse 2.
@@ -135,7 +155,9 @@ class LoadLidarSweeps(LoadPointsFromMultiSweeps):
 
         Raises:
             BrokenSampleError: If a file is missing or damaged.
+            ValueError: If ``results['points']`` are not in the annotation frame (`PointsToFrame`).
         """
+        check_points_in_frame(results, "LoadLidarSweeps")
         return _name_sample_in_errors(super().transform, results)
 
     def _load_points(self, pts_filename: str) -> np.ndarray:
@@ -153,6 +175,9 @@ class PointsToFrame(BaseTransform):
 
     The transform must come after ``LoadLidarPoints`` and before ``LoadLidarSweeps``. The latter
     transforms the points of earlier sweeps to the annotation frame itself before it adds them.
+
+    Transforms that need points in the annotation frame refuse them unless ``lidar2frame`` is the
+    identity. This transform sets it to the identity, and a transform that replaces it must do so.
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
@@ -165,6 +190,7 @@ class PointsToFrame(BaseTransform):
             shift = frame_from_lidar[:3, 3]
             points.tensor[:, :3] = points.tensor[:, :3] @ rotation.T + shift
             results["points"] = points
+            results["lidar2frame"] = np.eye(4)
         return results
 
 
@@ -187,7 +213,12 @@ class MakeDepthMap(BaseTransform):
     pad_size_divisor: int = 32
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Project the points into each camera view."""
+        """Project the points into each camera view.
+
+        Raises:
+            ValueError: If the points are not in the annotation frame (`PointsToFrame`).
+        """
+        check_points_in_frame(results, "MakeDepthMap")
         points = results["points"].tensor[:, :3].numpy().astype(np.float64)
         homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=-1)
         height, width = padded_size(results["img_shape"], self.pad_size_divisor)
