@@ -1,6 +1,7 @@
 """One's own drives in nuScenes' format: names of towns, cameras, LiDARs, scenes and split lists."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.utils.errors import InputError
 from mapdata.inputs import open_input
 from mapdata.nuscenes.can_bus import read_messages
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
@@ -81,6 +83,72 @@ def test_a_lidar_of_another_name_is_taken_in_the_frame_of_the_vehicle(options, d
             read(damaged_root)
     samples, _ = converted(replace(options, frame="ego"), damaged_root)
     assert all("LIDAR" in sample.lidar.path for sample in samples)
+
+
+def test_signals_are_dropped_of_drives_of_nuscenes_alone_and_counted(options, damaged_root):
+    (first, second) = json.loads((damaged_root / "v1.0-trainval/scene.json").read_text())
+    names = {first["name"]: "scene-0161", second["name"]: "scene-0314"}
+    edit(damaged_root, "scene", lambda scene: {"name": names[scene["name"]]})
+    for old, new in names.items():
+        folder = damaged_root / "can_bus"
+        (folder / f"{old}_pose.json").rename(folder / f"{new}_pose.json")
+    split = damaged_root / "v1.0-trainval/splits.json"
+    split.write_text(json.dumps({"train": list(names.values())}))
+
+    def signals(samples: list) -> list[bool]:
+        return [bool(sample.can_bus[7:16].any()) for sample in samples]
+
+    samples, summary = converted(options, damaged_root)
+    assert all(signals(samples))
+    assert all(signals(open_input(damaged_root).samples))
+    assert "without vehicle signals" not in summary
+    edit(damaged_root, "log", lambda _: {"logfile": "n008-2018-08-01-15-16-36-0400"})
+    samples, summary = converted(options, damaged_root)
+    assert not any(signals(samples))
+    assert not any(signals(open_input(damaged_root).samples))
+    assert "2 x scene without vehicle signals: the nuScenes devkit rejects its CAN" in summary
+    assert all(name in summary for name in names.values())
+
+
+def refuse_names(options: NuScenesOptions, root: Path, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        convert_nuscenes(replace(options, root=root))
+    assert not list(options.out_dir.glob("*.arrow"))
+
+
+@pytest.mark.parametrize("name", ["drive", "scene-0001", ""])
+def test_two_drives_of_one_name_are_refused(name, options, damaged_root):
+    scenes = json.loads((damaged_root / "v1.0-trainval/scene.json").read_text())
+    one, other = (scene["token"] for scene in scenes)
+    edit(damaged_root, "scene", lambda _: {"name": name})
+    message = f"two scenes have the name {name!r}: {one!r} in .*{other!r} in .*rename one of them"
+    refuse_names(options, damaged_root, message)
+    with pytest.raises(InputError, match=message):
+        open_input(damaged_root)
+
+
+@pytest.mark.parametrize("listed", ["name", "token"])
+def test_drives_of_one_name_in_two_versions_are_refused(listed, options, damaged_root, tmp_path):
+    """The versions have a drive each; a list may name one of them by its token."""
+    versions = ("v1.0-trainval", "day2")
+    shutil.copytree(damaged_root / versions[0], damaged_root / versions[1])
+    for version, keep in zip(versions, (0, 1), strict=True):
+        path = damaged_root / version / "scene.json"
+        scene = json.loads(path.read_text())[keep]
+        path.write_text(json.dumps([{**scene, "name": "scene-0001"}]))
+        (damaged_root / version / "splits.json").write_text(
+            json.dumps({"train": [scene["token"] if listed == "token" else "scene-0001"]})
+        )
+    joined = replace(options, version=versions)
+    message = r"'scene-0001': .*v1\.0-trainval/scene\.json.*day2/scene\.json; .*each version with"
+    refuse_names(joined, damaged_root, message)
+    path = damaged_root / "day2/scene.json"
+    path.write_text(path.read_text().replace('"scene-0001"', '"scene-0002"'))
+    if listed == "name":
+        split = damaged_root / "day2/splits.json"
+        split.write_text(json.dumps({"val": ["scene-0002"]}))
+    samples, _ = converted(joined, damaged_root)
+    assert {sample.scene for sample in samples} == {"scene-0001", "scene-0002"}
 
 
 def test_samples_of_an_input_without_the_lidar_are_counted(damaged_root):

@@ -11,11 +11,15 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 
 _NUSCENES_SCENE = re.compile(r"scene-(\d{4})")
+# Log file of a nuScenes drive: vehicle, date, time and time zone, such as
+# n015-2018-07-24-11-22-45+0800.
+_NUSCENES_LOG = re.compile(r"n\d{3}-\d{4}(-\d{2}){5}[+-]\d{4}")
 # Fields of a message: time in microseconds, acceleration, rotation rate and velocity.
 _FIELDS = ("utime", "accel", "rotation_rate", "vel")
 Messages = tuple[np.ndarray, np.ndarray]
 """Ascending times in microseconds (n,), and acceleration in m/s^2, rotation rate in rad/s and
 velocity in m/s, three numbers each (n, 9)."""
+NO_MESSAGES: Messages = (np.zeros(0, np.int64), np.zeros((0, 9)))
 
 
 def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Messages) -> np.ndarray:
@@ -48,15 +52,14 @@ def read_messages(dataroot: Path, scene: str) -> Messages:
         scene: Name of the scene.
 
     Returns:
-        The messages by ascending time. Empty if the expansion has no file of the scene, and for the
-        scenes that the nuScenes devkit rejects (161 to 176, 309 to 314).
+        The messages by ascending time. Empty if the expansion has no file of the scene.
 
     Raises:
         ValueError: If the file of the scene is damaged.
     """
-    path = dataroot / f"can_bus/{scene}_pose.json"
-    if not path.is_file() or _is_unreliable(scene, dataroot):
-        return np.zeros(0, np.int64), np.zeros((0, 9))
+    path = _messages_path(dataroot, scene)
+    if not path.is_file():
+        return NO_MESSAGES
     remedy = "unpack the CAN bus expansion again; a message has " + ", ".join(_FIELDS)
     with explain_errors(path, remedy=remedy):
         messages = read_json(path)
@@ -73,9 +76,30 @@ def read_messages(dataroot: Path, scene: str) -> Messages:
     return times_us[order], measurements[order]
 
 
-def _is_unreliable(scene: str, dataroot: Path) -> bool:
-    """Whether a scene is a nuScenes scene whose signals the devkit rejects."""
+def is_rejected(dataroot: Path, scene: str, logfile: object) -> bool:
+    """Test whether a scene is a drive of nuScenes whose messages the nuScenes devkit rejects.
+
+    Scenes of other data sets may have the names of these drives. They are told apart by the names
+    of the log files.
+
+    Args:
+        dataroot: Data root with the folder ``can_bus``.
+        scene: Name of the scene.
+        logfile: Field ``logfile`` of the log of the scene; None if there is no such field.
+
+    Returns:
+        True if the messages are rejected; False also for a scene without a file of messages.
+    """
+    number = _NUSCENES_SCENE.fullmatch(scene)
+    if number is None or not isinstance(logfile, str) or not _NUSCENES_LOG.fullmatch(logfile):
+        return False
+    if not _messages_path(dataroot, scene).is_file():
+        return False
     from nuscenes.can_bus.can_bus_api import NuScenesCanBus
 
-    number = _NUSCENES_SCENE.fullmatch(scene)
-    return number is not None and int(number[1]) in NuScenesCanBus(str(dataroot)).can_blacklist
+    return int(number[1]) in NuScenesCanBus(str(dataroot)).can_blacklist
+
+
+def _messages_path(dataroot: Path, scene: str) -> Path:
+    """File of the ``pose`` messages of a scene."""
+    return dataroot / f"can_bus/{scene}_pose.json"

@@ -44,7 +44,7 @@ from mapdata.nuscenes.map import (
     maps_in,
     open_layers,
 )
-from mapdata.nuscenes.tables import CAMERAS, NuScenesTables, versions_in
+from mapdata.nuscenes.tables import CAMERAS, NuScenesTables, check_scene_names, versions_in
 from mapdata.overlap import Positions, overlap_notes
 from mapdata.splits import (
     OFFICIAL,
@@ -247,6 +247,7 @@ class _Conversion:
             )
             for scene in tables.scene:
                 self.scenes.append((scene, tables))
+        check_scene_names(self.scenes)
         split_list, self.identity = _select_splits(options)
         self.split_of, notes = _resolve_splits(split_list, options, scenes=self.scenes)
         self.summary.notes += notes
@@ -301,6 +302,10 @@ class _Conversion:
         layers = open_layers(options.root, expansion_name, classes=options.classes)
         for reason, count in layers.skipped.items():
             self.summary.add_problem(f"{reason} left out", expansion_name, count=count)
+        for scene, tables in scenes:
+            if tables.has_rejected_signals(scene):
+                rejected = "scene without vehicle signals: the nuScenes devkit rejects its CAN bus"
+                self.summary.add_problem(rejected, scene["name"])
         local_map = NuScenesLocalMap(
             layers,
             options.classes,

@@ -17,7 +17,13 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from gsmap.utils.json_items import items_of
 from gsmap.utils.words import format_count
-from mapdata.nuscenes.can_bus import read_messages, signals_at
+from mapdata.nuscenes.can_bus import (
+    NO_MESSAGES,
+    Messages,
+    is_rejected,
+    read_messages,
+    signals_at,
+)
 
 CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
@@ -151,6 +157,7 @@ class NuScenesTables:
 
     Attributes:
         cameras: Channels of the cameras, the six of nuScenes first.
+        folder: Folder of the tables.
         lidar: Channel of the LiDAR.
         scene: Records of all scenes.
 
@@ -161,19 +168,20 @@ class NuScenesTables:
 
     def __init__(self, version: str, dataroot: Path, max_sweeps: int, frame: str = "lidar") -> None:
         self.frame = frame
-        self._folder = dataroot / version
+        self.folder = dataroot / version
+        self._dataroot = dataroot
         self._max_sweeps = max_sweeps
         # Messages of the CAN bus by scene; only the latest scene is kept.
         self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))
         # Records of each table by token. A table is stored after the tables that it refers to.
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
         for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
-            self._store(table, read_table(self._folder, table))
+            self._store(table, read_table(self.folder, table))
         self.cameras, self.lidar = self._sensor_channels()
         # A list, because the records are also needed to select poses and to fill `data`.
         sample_data = list(self._read_sample_data())
         pose_tokens = {record["ego_pose_token"] for record in sample_data}
-        poses = read_table(self._folder, "ego_pose")
+        poses = read_table(self.folder, "ego_pose")
         self._store("ego_pose", (pose for pose in poses if pose["token"] in pose_tokens))
         self._store("sample_data", sample_data)
         # Number of samples by token of the scene.
@@ -189,7 +197,7 @@ class NuScenesTables:
                 channel = self._channel_of(record)
                 if channel in sample["data"]:
                     problem = f" has two key frames of {channel} for sample {sample['token']!r}"
-                    raise _table_error(self._folder, "sample_data", problem=problem)
+                    raise _table_error(self.folder, "sample_data", problem=problem)
                 sample["data"][channel] = record
         self.scene = list(self._records["scene"].values())
 
@@ -202,14 +210,14 @@ class NuScenesTables:
             for link in _LINKS.get(table, ()):
                 self._check_link(table, record, name=link)
             if token in records_by_token:
-                raise _table_error(self._folder, table, problem=f" has record {token!r} twice")
+                raise _table_error(self.folder, table, problem=f" has record {token!r} twice")
             records_by_token[token] = record
 
     def _check_link(self, table: str, record: dict[str, Any], name: str) -> None:
         """Raise a ``ValueError`` if the field ``name`` of a record refers to a missing record."""
         if record[name] not in self._records[_LINKS[table][name]]:
             problem = f", record {record['token']!r}: {name} {record[name]!r} leads nowhere"
-            raise _table_error(self._folder, table, problem=problem)
+            raise _table_error(self.folder, table, problem=problem)
 
     def _channel_of(self, record: dict[str, Any]) -> str:
         """Channel of the sensor of a ``sample_data`` record."""
@@ -244,7 +252,7 @@ class NuScenesTables:
         if len(lidars) == 1 and self.frame == "ego":
             return cameras, lidars[0]
         raise InputError(
-            f"{self._folder} has no {LIDAR}, which defines the frame `lidar`, but the channels "
+            f"{self.folder} has no {LIDAR}, which defines the frame `lidar`, but the channels "
             f"{sorted(channels)!r:.300}. Name the LiDAR {LIDAR} if its axes are (x right, y "
             "ahead); else convert with --frame ego, which takes one LiDAR of any name."
         )
@@ -256,7 +264,7 @@ class NuScenesTables:
         """
         key_frame_channels = {self.lidar, *self.cameras}
         names = ("token", *_FIELDS["sample_data"])
-        for record in read_table(self._folder, "sample_data"):
+        for record in read_table(self.folder, "sample_data"):
             # `_store` checks all links later, but the channel is needed first.
             self._check_link("sample_data", record, name="calibrated_sensor_token")
             channel = self._channel_of(record)
@@ -287,10 +295,10 @@ class NuScenesTables:
         while token:
             if token not in records:
                 problem = f" has no record {token!r}, to which {record['token']!r} leads"
-                raise _table_error(self._folder, table, problem=problem)
+                raise _table_error(self.folder, table, problem=problem)
             if token in visited_tokens:
                 problem = f", record {record['token']!r}: {step} leads back to {token!r}"
-                raise _table_error(self._folder, table, problem=problem)
+                raise _table_error(self.folder, table, problem=problem)
             visited_tokens.add(token)
             record = records[token]
             yield record
@@ -310,7 +318,7 @@ class NuScenesTables:
                     f", record {scene['token']!r}: links lead to sample {sample['token']!r} of "
                     "another scene"
                 )
-                raise _table_error(self._folder, "scene", problem=problem)
+                raise _table_error(self.folder, "scene", problem=problem)
             number += 1
             yield sample
         expected = self._num_samples[scene["token"]] or number
@@ -319,7 +327,7 @@ class NuScenesTables:
                 f", record {scene['token']!r}: links lead to {number} of its "
                 f"{format_count(expected, 'sample')}"
             )
-            raise _table_error(self._folder, "scene", problem=problem)
+            raise _table_error(self.folder, "scene", problem=problem)
 
     def location_of(self, scene: dict[str, Any]) -> str:
         """Name of the map of a scene. The poses of the scene are in the frame of this map."""
@@ -338,8 +346,22 @@ class NuScenesTables:
         name = log.get("map_expansion", log["location"])
         if not isinstance(name, str):
             problem = f", record {log['token']!r}: map_expansion must be a str, got {name!r:.60}"
-            raise _table_error(self._folder, "log", problem=problem)
+            raise _table_error(self.folder, "log", problem=problem)
         return name
+
+    def has_rejected_signals(self, scene: dict[str, Any]) -> bool:
+        """Test whether the nuScenes devkit rejects the CAN bus messages of a scene.
+
+        Acceleration, rotation rate and velocity of its samples are 0.
+        """
+        logfile = self._records["log"][scene["log_token"]].get("logfile")
+        return is_rejected(self._dataroot, scene["name"], logfile=logfile)
+
+    def _scene_messages(self, scene: dict[str, Any]) -> Messages:
+        """CAN bus messages of a scene; none if the nuScenes devkit rejects them."""
+        if self.has_rejected_signals(scene):
+            return NO_MESSAGES
+        return self._messages(scene["name"])
 
     def _global_from_sensor(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Transform from the sensor of a record to the map (4, 4), and the calibration record."""
@@ -373,7 +395,7 @@ class NuScenesTables:
                 camera = self._camera(name, sample["data"][name], global_from_frame)
                 cameras.append(camera)
         timestamp_ns = sample["timestamp"] * 1000
-        messages = self._messages(scene["name"])
+        messages = self._scene_messages(scene)
         return MapSample(
             token=sample["token"],
             scene=scene["name"],
@@ -420,6 +442,26 @@ class NuScenesTables:
         return sweeps
 
 
+def check_scene_names(scenes: Iterable[tuple[dict[str, Any], NuScenesTables]]) -> None:
+    """Raise a ``ValueError`` if two scenes have one name, since they would become one drive.
+
+    Args:
+        scenes: Records of the scenes, each with the tables of its version.
+    """
+    first_with_name: dict[str, tuple[str, Path]] = {}  # token and folder of the first scene
+    for scene, tables in scenes:
+        name = scene["name"]
+        token, folder = first_with_name.setdefault(name, (scene["token"], tables.folder))
+        if token != scene["token"]:
+            remedy = "rename one of them in scene.json, its file in can_bus and its split list"
+            if folder != tables.folder:
+                remedy += ", or convert each version with a --dataset of its own"
+            raise InputError(
+                f"two scenes have the name {name!r}: {token!r} in {folder / 'scene.json'} and "
+                f"{scene['token']!r} in {tables.folder / 'scene.json'}; {remedy}."
+            )
+
+
 def versions_in(root: Path) -> list[str]:
     """Sorted names of the version folders in a data root; empty without nuScenes tables."""
     names = []
@@ -442,8 +484,8 @@ def read_nuscenes(
         The samples, and a note with the number of samples without a key frame, if there are any.
 
     Raises:
-        ValueError: If the version is missing or ambiguous, there is no sample, or a table is
-            damaged.
+        ValueError: If the version is missing or ambiguous, there is no sample, two scenes have one
+            name, or a table is damaged.
     """
     versions = versions_in(root)
     if version is None and len(versions) > 1:
@@ -451,6 +493,7 @@ def read_nuscenes(
     if version is not None and version not in versions:
         raise InputError(f"{root} holds no version {version!r}, but {versions}.")
     tables = NuScenesTables(version or versions[0], root, max_sweeps=10)
+    check_scene_names((scene, tables) for scene in tables.scene)
     samples = []
     total = 0
     for scene in tables.scene:
