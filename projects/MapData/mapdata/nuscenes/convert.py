@@ -402,6 +402,8 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
                 source_fingerprint=source_fingerprint,
                 versions=package_versions,
                 options=choices,
+                # The origin of the vehicle is on the road, unlike in Argoverse 2.
+                ground_z_m=0.0 if options.frame == "ego" else None,
             )
             target = options.path_of(options.dataset, split)
             writer = AnnotationWriter(target, meta, shard=options.shard)

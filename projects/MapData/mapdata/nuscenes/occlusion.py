@@ -119,7 +119,7 @@ def ground_view(meta: AnnotationMeta) -> FrameView:
         meta: Metadata of the annotation file.
     """
     ground_z_m = meta.ground_z_m
-    if ground_z_m is None and meta.frame == "ego":
+    if ground_z_m is None and meta.frame == "ego":  # a file of an earlier version
         ground_z_m = 0.0
     return frame_view(meta.frame, ground_z_m)
 
