@@ -128,6 +128,36 @@ def test_a_file_without_poses_has_none_as_a_source(minicity_annotations, tmp_pat
     assert not open_annotations(tmp_path / "a.arrow").has_poses
 
 
+@pytest.mark.parametrize(
+    ("frame", "ground_z_m", "has_mounting", "height_m"),
+    [
+        ("lidar", None, True, 1.9),  # z = 0 of the vehicle is the road
+        ("lidar", -2.5, True, 1.9),
+        ("lidar", -2.5, False, 2.5),
+        ("lidar", None, False, None),  # not known
+        ("ego", None, False, 0.31),  # the axle of Argoverse 2
+        ("ego", 0.0, False, 0.0),
+        ("ego", -1.6, False, 1.6),
+    ],
+)
+def test_the_height_of_the_frame_above_the_road(
+    build, minicity_annotations, tmp_path, frame, ground_z_m, has_mounting, height_m
+):
+    sample = AnnotationFile(minicity_annotations["train"])[0]
+    mounting = np.eye(4)
+    mounting[2, 3] = 1.9
+    sample = replace(sample, ego_from_frame=mounting if has_mounting else None)
+    source = AnnotationFile(minicity_annotations["train"]).meta
+    meta = replace(source, frame=frame, ground_z_m=ground_z_m)  # with the range of the config
+    write_annotations(tmp_path / "a.arrow", meta, [sample])
+    config = dataset_config(MINICITY, "train_dataloader", tmp_path, ann_file="a.arrow")
+    lidar2ground = build(**{**config, "frame": frame}).get_data_info(0)["lidar2ground"]
+    if height_m is None:
+        assert lidar2ground is None
+    else:
+        assert lidar2ground[2, 3] == pytest.approx(height_m)
+
+
 def test_signals_of_the_pose_alone_are_those_of_maptr_on_argoverse_2(
     build, minicity_root, minicity_annotations
 ):

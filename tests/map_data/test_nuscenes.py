@@ -266,7 +266,8 @@ def test_the_vehicle_s_frame_holds_the_same_world(
     run(parser.parse_args([*words.split(), *ranges.split()], argparse.Namespace(command="make it")))
     found = AnnotationFile(tmp_path / "gsmap_minicity_train_ego.arrow")
     found.require(frame="ego", x_range=(-30.0, 30.0), y_range=(-15.0, 15.0))
-    assert found.meta.ground_z_m == 0.0
+    assert found.meta.ground_z_m == 0.0  # the road, in the vehicle's frame of nuScenes
+    assert AnnotationFile(minicity_annotations["train"]).meta.ground_z_m is None
     for ego, lidar in zip(found, AnnotationFile(minicity_annotations["train"]), strict=True):
         ego_from_lidar = lidar.ego_from_frame
         assert ego_from_lidar[2, 3] > 1  # on the roof

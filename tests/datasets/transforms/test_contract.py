@@ -179,6 +179,7 @@ def results_of(folder: Path, truth: list[MapInstance]) -> dict[str, Any]:
         "x_range": (-15.0, 15.0),
         "y_range": (-30.0, 30.0),
         "lidar2ego": pose(5),
+        "lidar2ground": pose(5),
         "lidar2frame": np.eye(4),
         "timestamp": 1.0,
         "lidar_points": sweep,

@@ -29,16 +29,17 @@ IMAGES = KINDS[KINDS.index("fog") :]
 def results(views: int = 6, token: str = "a") -> dict:
     rng = np.random.default_rng(1)
     image = cv2.resize(rng.integers(0, 255, (9, 16, 3), dtype=np.uint8), (160, 90))
-    lidar2ego = np.eye(4)
-    lidar2ego[2, 3] = 2.0
+    lidar2ground = np.eye(4)
+    lidar2ground[2, 3] = 2.0
     return {
         "token": token,
         "img": [image.copy() for _ in range(views)],
+        "raw_shapes": [(90, 160)] * views,
         "cam2img": [INNER] * views,
         "img_aug_matrix": [np.eye(4)] * views,
         "lidar2cam": [LOOK] * views,
         "lidar2img": [INNER @ LOOK] * views,
-        "lidar2ego": lidar2ego,
+        "lidar2ground": lidar2ground,
     }
 
 
@@ -128,8 +129,36 @@ def test_fog_leaves_five_percent_of_the_contrast_at_the_end_of_sight():
 
 
 def test_fog_needs_the_height_of_the_cameras():
-    with pytest.raises(ValueError, match="sample 'a' has no ego_from_frame, which fog needs"):
-        CorruptImages("fog", 1).transform({**results(), "lidar2ego": None})
+    message = "sample 'a' has no ego_from_frame and its file no ground_z_m, one of which fog needs"
+    with pytest.raises(ValueError, match=message):
+        CorruptImages("fog", 1).transform({**results(), "lidar2ground": None})
+
+
+@pytest.mark.parametrize("to_float32", [True, False])
+@pytest.mark.parametrize("kind", IMAGES)
+def test_padding_does_not_change_and_does_not_change_the_picture(kind, to_float32):
+    """Of three cameras, two have smaller images, padded at the bottom and right."""
+    shapes = [(60, 160), (90, 100), (90, 160)]
+    padded = results(3)
+    padded["raw_shapes"] = shapes
+    if to_float32:
+        padded["img"] = [image.astype(np.float32) for image in padded["img"]]
+    for image, (height, width) in zip(padded["img"], shapes, strict=True):
+        image[height:] = 0
+        image[:, width:] = 0
+    before = [image.copy() for image in padded["img"]]
+    cut = {**padded, "img": [padded["img"][0][:60]], "raw_shapes": shapes[:1]}
+    found = CorruptImages(kind, 5).transform(dict(padded))["img"]
+    for image, clean, (height, width) in zip(found, before, shapes, strict=True):
+        assert image.shape == clean.shape
+        assert image.dtype == clean.dtype
+        assert not image[height:].any()
+        assert not image[:, width:].any()
+        assert not np.array_equal(image[:height, :width], clean[:height, :width])
+    for image, clean in zip(padded["img"], before, strict=True):  # of the caller
+        np.testing.assert_array_equal(image, clean)
+    (alone,) = CorruptImages(kind, 5).transform(cut)["img"]  # without padding
+    np.testing.assert_array_equal(found[0][:60], alone)
 
 
 @pytest.mark.parametrize(("kind", "severity"), [("snow", 1), ("fog", 0), ("fog", 6)])

@@ -356,10 +356,11 @@ class VectorizedMapDataset(BaseDataset):
             the form of mmdet3d's multi-view pipelines. ``map_instances`` has the elements at full
             resolution, with ``dim`` coordinates per point in metres. ``map_heights`` has the
             heights of the n points of each element in metres, (n,), or None for a file without
-            heights. ``eval_ann_info`` has labels and polylines for evaluation; it and
-            ``map_instances`` are None without ground truth. Further keys are ``dim`` and the
-            metainfo of the packed sample. In names such as ``lidar2global``, ``lidar`` is the
-            annotation frame, as in mmdet3d.
+            heights. ``lidar2ground`` leads to the ground below the rear axle (x ahead, y left, z
+            up), or is None if the height of a LiDAR above it is unknown. ``eval_ann_info`` has
+            labels and polylines for evaluation; it and ``map_instances`` are None without ground
+            truth. Further keys are ``dim`` and the metainfo of the packed sample. In names such as
+            ``lidar2global``, ``lidar`` is the annotation frame, as in mmdet3d.
 
         Raises:
             BrokenSampleError: If the sample lacks a camera of ``cameras``.
@@ -393,6 +394,7 @@ class VectorizedMapDataset(BaseDataset):
             "timestamp": sample.timestamp_ns / 1e9,
             "lidar2global": sample.global_from_frame if self.annotations.meta.has_poses else None,
             "lidar2ego": sample.ego_from_frame,
+            "lidar2ground": self._ground_from_frame(sample),
             "can_bus": self._vehicle_signals(sample, entry["row"]),
             "images": images,
             "cam_names": list(images),
@@ -410,6 +412,18 @@ class VectorizedMapDataset(BaseDataset):
             info["timestamp"] = frame.timestamp_ns / 1e9
             info["lidar2global"] = frame.pose
         return info
+
+    def _ground_from_frame(self, sample: MapSample) -> np.ndarray | None:
+        """Return the transform in metres from the frame of a sample to the ground. (4, 4)
+
+        It is None if the frame is that of a LiDAR, and neither the height of the road nor the
+        mounting of the LiDAR is known. The frame ``ego`` has a usual height.
+        """
+        frame = self._metainfo["frame"]
+        ground_z_m = self._metainfo["ground_z_m"]
+        if frame == "lidar" and ground_z_m is None and sample.ego_from_frame is None:
+            return None
+        return ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
 
     def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
         """Return the vehicle signals of a sample, zero if unknown. (18,)

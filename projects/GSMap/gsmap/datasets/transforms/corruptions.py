@@ -87,7 +87,8 @@ def _set_extrinsics(results: dict[str, Any], view: int, lidar2cam: NDArray[np.fl
 class CorruptImages(BaseTransform):
     """Transform that corrupts the images or the calibration of all cameras.
 
-    The transform must come after ``LoadCameraImages``.
+    The transform must come after ``LoadCameraImages``. The padding of smaller images (see there)
+    does not change.
 
     Args:
         kind: Kind of corruption, one of ``KINDS``. ``camera_lost`` blacks out as many cameras as
@@ -136,11 +137,26 @@ class CorruptImages(BaseTransform):
             for view in views:
                 results["img"][view] = fog(results, view, visibility_m=_VISIBILITY_M[level])
         else:
-            for view, image in enumerate(results["img"]):
-                corrupt = _IMAGE_CORRUPTIONS[self.kind]
-                corrupted = corrupt(_grey_levels(image), level, rng)
-                results["img"][view] = corrupted.astype(image.dtype)
+            corrupt = _IMAGE_CORRUPTIONS[self.kind]
+            for view in views:
+                picture = _without_padding(results, view)
+                corrupted = corrupt(_grey_levels(picture), level, rng)
+                results["img"][view] = _with_padding(results, view, picture=corrupted)
         return results
+
+
+def _without_padding(results: dict[str, Any], view: int) -> NDArray[Any]:
+    """Return the image of a view without its padding at the bottom and right. (H, W, 3)"""
+    height, width = results["raw_shapes"][view]
+    return np.asarray(results["img"][view][:height, :width])
+
+
+def _with_padding(results: dict[str, Any], view: int, picture: NDArray[Any]) -> NDArray[Any]:
+    """Return the image of a view, in which a picture replaces all but the padding. (H, W, 3)"""
+    image = results["img"][view].copy()
+    height, width = picture.shape[:2]
+    image[:height, :width] = picture.astype(image.dtype)
+    return np.asarray(image)
 
 
 def _grey_levels(image: NDArray[Any]) -> Image:
@@ -161,30 +177,33 @@ def fog(results: dict[str, Any], view: int, visibility_m: float) -> NDArray[Any]
         visibility_m: Limit of visibility in metres.
 
     Returns:
-        Image. (H, W, 3)
+        Image with its padding. (H, W, 3)
 
     Raises:
-        ValueError: If the pose of the annotation frame on the vehicle is unknown.
+        ValueError: If the height of the annotation frame above the road is unknown.
     """
-    if results["lidar2ego"] is None:
+    ground_from_frame = results["lidar2ground"]
+    if ground_from_frame is None:
         raise InputError(
-            f"sample {results['token']!r} has no ego_from_frame, which fog needs for the height of "
-            "the cameras: add it to the annotation file, or leave out fog."
+            f"sample {results['token']!r} has no ego_from_frame and its file no ground_z_m, one of "
+            "which fog needs for the height of the cameras: set one of them (ground_z_m also in "
+            "the data set of the config), or leave out fog."
         )
-    image = results["img"][view]
+    image = _without_padding(results, view)
     height, width = image.shape[:2]
     cols, rows = np.meshgrid(np.arange(width), np.arange(height))
     pixels = np.stack([cols, rows, np.ones((height, width))])  # (3, H, W)
     intrinsics = results["img_aug_matrix"][view][:3, :3] @ results["cam2img"][view][:3, :3]
-    ego_from_cam = results["lidar2ego"] @ invert_rigid(results["lidar2cam"][view])
-    rays = ego_from_cam[:3, :3] @ np.linalg.solve(intrinsics, pixels.reshape(3, -1))  # (3, H * W)
+    ground_from_cam = ground_from_frame @ invert_rigid(results["lidar2cam"][view])
+    cam_rays = np.linalg.solve(intrinsics, pixels.reshape(3, -1))  # (3, H * W)
+    rays = ground_from_cam[:3, :3] @ cam_rays
     slopes = rays[2] / np.linalg.norm(rays, axis=0)  # rise per metre of distance
     slopes = np.minimum(slopes, -1e-6)  # rays above the horizon would never reach the ground
-    # The ground is taken to be at z = 0 in the frame of the vehicle.
-    camera_height_m = np.maximum(ego_from_cam[2, 3], 0.1)
+    camera_height_m = np.maximum(ground_from_cam[2, 3], 0.1)
     distance_m = np.minimum(camera_height_m / -slopes, _MAX_FOG_DISTANCE_M)
     contrast = np.exp(np.log(0.05) / visibility_m * distance_m).reshape(height, width, 1)
-    return (image * contrast + _FOG_GREY * (1 - contrast)).astype(image.dtype)
+    foggy = image * contrast + _FOG_GREY * (1 - contrast)
+    return _with_padding(results, view, picture=foggy)
 
 
 def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
