@@ -15,6 +15,7 @@ import gsmap  # noqa: F401
 # isort: split
 import argparse
 import json
+from collections.abc import Mapping, Sequence
 from itertools import product
 from math import isnan
 from pathlib import Path
@@ -39,6 +40,7 @@ KINDS = (
 SEVERITIES = (1, 2, 3, 4, 5)
 CLEAN = "none"  # key of the figures without corruption, which are measured once
 _DELAYED = "camera_delayed"
+_OF_SEVERAL_CAMERAS = ("camera_lost", _DELAYED)  # their severity is a number of cameras
 
 
 def parse_args() -> argparse.Namespace:
@@ -103,6 +105,73 @@ def add_corruption(settings: Any, kind: str, severity: int, seed: int) -> dict[s
     return {**settings, "pipeline": steps}
 
 
+def measured_indices(dataset: Any, samples: int | None) -> list[int]:
+    """Indices of the samples that are measured.
+
+    Args:
+        dataset: The data set.
+        samples: Number of samples, evenly spread; None for all.
+    """
+    count = min(samples or len(dataset), len(dataset))
+    places = np.linspace(0, len(dataset) - 1, count)
+    return places.round().astype(int).tolist()
+
+
+def severities_of(kinds: Sequence[str], dataset: Any, indices: Sequence[int]) -> dict[str, int]:
+    """Largest severity of each kind of corruption that all measured samples allow; 0 for none.
+
+    As many cameras as the severity are lost or delayed, and one camera must remain. The first
+    sample of a scene has no earlier one to delay cameras by.
+
+    Args:
+        kinds: Kinds of corruptions, of ``KINDS``.
+        dataset: The data set.
+        indices: Indices of the measured samples.
+    """
+    counts = []  # number of cameras of each sample
+    for index in indices:
+        names = [camera.name for camera in dataset.sample(index).cameras]
+        if dataset.cameras is not None:
+            names = [name for name in names if name in dataset.cameras]
+        counts.append(len(names))
+    largest = max(min(counts) - 1, 0)
+    first_samples = {scene[0] for scene in dataset.scenes()}
+    severities = {}
+    for kind in kinds:
+        severities[kind] = SEVERITIES[-1]
+        if kind in _OF_SEVERAL_CAMERAS:
+            severities[kind] = min(largest, SEVERITIES[-1])
+        if kind == _DELAYED and first_samples.issuperset(indices):
+            severities[kind] = 0
+    return severities
+
+
+def notes_on(severities: Mapping[str, int]) -> list[str]:
+    """Sentences on the kinds of corruptions that are measured at few severities or at none.
+
+    Args:
+        severities: Largest severity of each kind, 0 for none.
+
+    Raises:
+        ValueError: If no kind can be measured.
+    """
+    notes = []
+    for kind, largest in severities.items():
+        if largest == 0:
+            notes.append(
+                f"{kind} is left out: it needs several cameras in all samples, and camera_delayed "
+                "also samples that are not the first of their scenes."
+            )
+        elif largest < SEVERITIES[-1]:
+            notes.append(
+                f"{kind} has no figures above severity {largest}, as a sample has only "
+                f"{largest + 1} cameras."
+            )
+    if not any(severities.values()):
+        raise InputError(f"nothing to measure: {' '.join(notes)} Give other --kinds.")
+    return notes
+
+
 def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[str, float]:
     """AP_chamfer of each class, and ``mean``, in percent.
 
@@ -118,15 +187,13 @@ def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[s
     dataset = DATASETS.build(settings)
     metric = METRICS.build({"type": "MapMetric", "eval": ["chamfer"]})
     metric.dataset_meta = dataset.metainfo  # classes and range, which a runner would set
-    count = min(samples or len(dataset), len(dataset))
-    places = np.linspace(0, len(dataset) - 1, count)
-    indices = places.round().astype(int)
-    for index in indices.tolist():
+    indices = measured_indices(dataset, samples)
+    for index in indices:
         batch = pseudo_collate([dataset[index]])
         predictions = [sample.to_dict() for sample in model.test_step(batch)]
         # The metric reads only the predictions, with their ground truth, and not the input batch.
         metric.process(None, predictions)
-    figures = metric.evaluate(count)  # all samples that were processed
+    figures = metric.evaluate(len(indices))  # all samples that were processed
     aps = {}
     for name in dataset.metainfo["classes"]:
         aps[name] = 100 * figures[f"chamfer/{name}/AP"]
@@ -148,11 +215,12 @@ def mean_aps(figures: dict[str, list[dict[str, float]]], kind: str) -> list[floa
 def resilience(figures: dict[str, list[dict[str, float]]], kind: str) -> float:
     """Mean AP over the severities as a share of the AP without corruption, in percent.
 
-    NaN if the AP without corruption is 0.
+    NaN if the AP without corruption is 0, or not all severities have an AP.
     """
     (clean,) = mean_aps(figures, CLEAN)  # a list of one value
-    if clean > 0:
-        mean_ap = float(np.mean(mean_aps(figures, kind)))
+    aps = mean_aps(figures, kind)
+    if clean > 0 and len(aps) == len(SEVERITIES):
+        mean_ap = float(np.mean(aps))
         return 100 * mean_ap / clean
     return float("nan")
 
@@ -166,6 +234,7 @@ def table(figures: dict[str, list[dict[str, float]]]) -> str:
         if kind == CLEAN:
             continue
         cells = [f"{ap:.1f}" for ap in mean_aps(figures, kind)]
+        cells += ["-"] * (len(SEVERITIES) - len(cells))
         share = resilience(figures, kind)
         last_cell = "-" if isnan(share) else f"{share:.0f} %"
         rows.append([kind, *cells, last_cell])
@@ -189,13 +258,16 @@ def earlier_figures(path: Path) -> dict[str, list[dict[str, float]]]:
 def are_figures(content: Any) -> bool:
     """Whether the content of a file has the form of figures of this command.
 
-    It has a list by corruption, with one dictionary of AP for each severity.
+    It has a list by corruption, with one dictionary of AP for each severity that was measured.
     """
     if not isinstance(content, dict) or CLEAN not in content:
         return False
     for kind, rows in content.items():
-        number = 1 if kind == CLEAN else len(SEVERITIES)
-        if kind not in (CLEAN, *KINDS) or not isinstance(rows, list) or len(rows) != number:
+        smallest = 1 if kind in (CLEAN, *_OF_SEVERAL_CAMERAS) else len(SEVERITIES)
+        largest = 1 if kind == CLEAN else len(SEVERITIES)
+        if kind not in (CLEAN, *KINDS) or not isinstance(rows, list):
+            return False
+        if not smallest <= len(rows) <= largest:
             return False
         for row in rows:
             if not isinstance(row, dict) or not isinstance(row.get("mean"), float):
@@ -262,6 +334,7 @@ def require_own_split(checkpoint: Path, settings: Any) -> None:
 def main() -> str:
     args = parse_args()
     import torch
+    from mmdet3d.registry import DATASETS
     from mmengine.logging import MMLogger
 
     from gsmap.apis.loading import load_model
@@ -283,7 +356,14 @@ def main() -> str:
         )
     # Without a logger of this level, the metric would log a table for each case.
     MMLogger.get_instance("robustness", log_level="ERROR")
-    cases = [(CLEAN, 1), *product(args.kinds, SEVERITIES)]
+    dataset = DATASETS.build(model.cfg.test_dataloader.dataset)
+    indices = measured_indices(dataset, args.samples)
+    severities = severities_of(args.kinds, dataset=dataset, indices=indices)
+    notes = notes_on(severities)
+    cases = [(CLEAN, 1)]
+    for kind, severity in product(args.kinds, SEVERITIES):
+        if severity <= severities[kind]:
+            cases.append((kind, severity))
     measured: dict[str, list[dict[str, float]]] = {}
     with (
         # No other process may write to the folder until the end of this context.
@@ -315,7 +395,7 @@ def main() -> str:
         (clean,) = means.pop(CLEAN)
         figure = plot_severities(means, clean, SEVERITIES)
         save_figure(figure, args.out / "robustness.png")
-    return f"{text}\nfiles: {args.out}"
+    return "\n".join([text, *notes, f"files: {args.out}"])
 
 
 if __name__ == "__main__":

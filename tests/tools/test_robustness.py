@@ -39,6 +39,70 @@ def test_corruptions_come_right_after_the_images_and_delays_before(tool):
         tool.add_corruption({**settings, "pipeline": [scale]}, "fog", 3, 7)
 
 
+class Drives:
+    """Two scenes of two samples.
+
+    Args:
+        cameras: Names of the cameras of all samples but the last.
+        last: Names of the cameras of the last sample.
+        used: Cameras that the config names.
+    """
+
+    def __init__(self, cameras: str, last: str, used: tuple[str, ...] | None = None) -> None:
+        self.names = [cameras, cameras, cameras, last]
+        self.cameras = used
+
+    def sample(self, index: int) -> Namespace:
+        return Namespace(cameras=[Namespace(name=name) for name in self.names[index]])
+
+    def scenes(self) -> list[list[int]]:
+        return [[1, 0], [2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("dataset", "indices", "lost", "delayed"),
+    [
+        (Drives("abcdef", "abcdef"), [0, 1, 2, 3], 5, 5),
+        (Drives("abc", "abc"), [0, 1, 2, 3], 2, 2),
+        (Drives("a", "a"), [0, 1, 2, 3], 0, 0),
+        (Drives("abcdef", "ab"), [0, 1, 2, 3], 1, 1),
+        (Drives("abcdef", "ab"), [0, 1], 5, 5),
+        (Drives("abcdef", "abcdef", used=("a", "c")), [0, 3], 1, 1),
+        (Drives("abcdef", ""), [3], 0, 0),
+        (Drives("abcdef", "abcdef"), [1, 2], 5, 0),  # the first ones of their scenes
+    ],
+)
+def test_as_many_cameras_fail_as_a_severity_says_or_it_has_no_figure(
+    tool, dataset, indices, lost, delayed
+):
+    kinds = ["camera_lost", "camera_delayed", "fog"]
+    found = tool.severities_of(kinds, dataset, indices)
+    assert found == {"camera_lost": lost, "camera_delayed": delayed, "fog": 5}
+    notes = tool.notes_on(found)
+    assert len(notes) == (lost < 5) + (delayed < 5)
+    for note in notes:
+        assert "is left out" in note or "has no figures above severity" in note
+
+
+def test_nothing_to_measure_with_one_camera_is_an_error(tool):
+    severities = tool.severities_of(["camera_lost"], Drives("a", "a"), [0])
+    with pytest.raises(ValueError, match=r"nothing to measure: camera_lost is left .* --kinds"):
+        tool.notes_on(severities)
+
+
+def test_severities_without_figures_are_dashes(tool, tmp_path):
+    from gsmap.visualization.plots import plot_severities
+
+    lost = [{"mean": 30.0}, {"mean": 20.0}]
+    found = {"none": [{"mean": 40.0}], "camera_lost": lost}
+    assert "| camera_lost | 30.0 | 20.0 | - | - | - | - |" in tool.table(found)
+    assert tool.are_figures(found)
+    assert not tool.are_figures({**found, "camera_lost": []})
+    assert not tool.are_figures({**found, "fog": lost})
+    (line,) = plot_severities({"camera_lost": [30.0, 20.0]}, 40.0, tool.SEVERITIES).axes[0].lines
+    assert line.get_xdata().tolist() == [0, 1, 2]
+
+
 def test_a_model_without_cameras_is_refused(tool, tmp_path, monkeypatch):
     (tmp_path / "a.pth").touch()
     monkeypatch.setattr(
@@ -63,7 +127,7 @@ def test_every_kind_is_registered_and_in_the_table(tool):
 
 @pytest.mark.parametrize(
     ("model", "samples"),
-    [("gsmap_r18_minicity", ["--samples", "1"]), ("gsmap_stream_finetune_r18_minicity", [])],
+    [("gsmap_r18_minicity", ["--samples", "2"]), ("gsmap_stream_finetune_r18_minicity", [])],
     ids=["single frames", "a memory, empty at the start of each corruption"],
 )
 def test_a_run_writes_table_figures_and_plot(

@@ -195,9 +195,9 @@ def plot_severities(
     """Plot the AP over the severity of each corruption.
 
     Args:
-        values: APs of each corruption, in percent. each (S,)
+        values: APs of each corruption at the first severities, in percent. each (S or fewer,)
         clean: AP without corruption, in percent.
-        severities: Severity of each column of ``values``. (S,)
+        severities: Severities in rising order. (S,)
 
     Returns:
         Figure.
@@ -206,7 +206,7 @@ def plot_severities(
     ax = axes[0, 0]
     for index, (name, aps) in enumerate(values.items()):
         ax.plot(
-            [0, *severities],
+            [0, *severities[: len(aps)]],
             [clean, *aps],
             "o-",
             color=f"C{index}",
