@@ -4,6 +4,7 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 const NEAR_M = 0.3; // a camera's lines are cut at this depth
+const RING_GAP_CM = 10; // a line whose ends are no farther apart is a ring
 const MASK_PX_PER_M = 4;
 const data = JSON.parse(document.getElementById("data").textContent);
 const pair = data.results.length === 2;
@@ -263,7 +264,11 @@ function projected(item, m) {
     h.push([0, 3, 6].map((row) => m[row] * x + m[row + 1] * y + m[row + 2]));
   }
   const hidden = h.findIndex((point) => point[2] < NEAR_M);
-  if (data.classes[item.c].area && hidden > 0) h = [...h.slice(hidden, -1), ...h.slice(0, hidden + 1)];
+  // A ring starts at a hidden point, so that its visible part is one path. An open line has no edge from its end to its start.
+  const last = item.p.length - 2;
+  const gap = Math.hypot(item.p[last] - item.p[0], item.p[last + 1] - item.p[1]);
+  const isRing = data.classes[item.c].area && gap <= RING_GAP_CM;
+  if (isRing && hidden > 0) h = [...h.slice(hidden), ...h.slice(gap ? 0 : 1, hidden + 1)];
   const pixel = (point) => `${(point[0] / point[2]).toFixed(1)} ${(point[1] / point[2]).toFixed(1)}`;
   let d = "";
   for (let i = 1; i < h.length; i++) {
