@@ -9,7 +9,7 @@ from argoverse2_road import bow_tie, crossing, pose, road_map, write_map
 from av2.geometry.geometry import quat_to_mat
 
 from mapdata.argoverse2.map import COMPAT_MODES, DEFAULT_RULES, Argoverse2Map
-from mapdata.argoverse2.rules import drop_duplicates, merge_until_stable
+from mapdata.argoverse2.rules import clip_polygons, drop_duplicates, merge_until_stable
 from mapdata.crossings import cut_rings, merge_parallel
 from mapdata.local_map import LocalPatch, rings_of
 
@@ -73,6 +73,31 @@ def test_a_crossing_cut_by_the_patch_is_open_or_closed_by_the_rules(road):
     (ring,) = road.extract(pose(x=-18.0), compat="maptr")["ped_crossing"]
     assert xy_sets([ring]) == {frozenset({(28.0, 5.0), (28.0, -5.0), (30.0, -5.0), (30.0, 5.0)})}
     np.testing.assert_array_equal(ring[0], ring[-1])
+
+
+def test_corners_of_the_patch_get_the_height_of_their_area():
+    """A slope of 10 % with a hole, around a patch of 60 x 30 m that is turned by 30 degrees."""
+    turned = pose()
+    cos, sin = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    turned[:2, :2] = [[cos, -sin], [sin, cos]]
+    patch = LocalPatch(turned, x_range=(-30, 30), y_range=(-15, 15))
+    centre = turned[:3, 3]
+
+    def square(half_m: float) -> np.ndarray:
+        x, y = half_m * np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]])
+        return centre + np.stack([x, y, 0.1 * x], axis=1)
+
+    slope = shapely.Polygon(square(80), holes=[square(5)])
+    flat = shapely.force_2d(slope)
+    (piece, flat_piece), _ = clip_polygons(np.array([slope, flat]), patch)
+    corners = shapely.get_coordinates(piece.exterior, include_z=True)
+    assert len(corners) == 5
+    x = corners[:, :2] @ turned[0, :2]  # east of the centre
+    np.testing.assert_allclose(corners[:, 2], 0.1 * x, atol=1e-9)
+    assert len(piece.interiors) == 1
+    hole = shapely.get_coordinates(piece.interiors[0], include_z=True)
+    np.testing.assert_allclose(hole[:, 2], 0.1 * (hole[:, :2] @ turned[0, :2]), atol=1e-9)
+    np.testing.assert_allclose(shapely.get_coordinates(flat_piece.exterior), corners[:, :2])
 
 
 def test_heights_are_relative_to_the_vehicle_and_follow_its_pitch(road):

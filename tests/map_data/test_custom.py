@@ -85,6 +85,41 @@ def test_height_is_interpolated_where_a_line_is_cut(tmp_path: Path):
     np.testing.assert_allclose(line.points, [[20, 0, 0], [30, 0, 1]])
 
 
+@pytest.mark.parametrize(
+    "xy",
+    [
+        [[29, -20], [60, -20], [60, 20], [29, 20]],  # two corners
+        [[20, 10], [50, 10], [50, 40], [20, 40]],  # one corner
+        [[-90, -70], [90, -50], [70, 90], [-80, 60]],  # the whole range
+        [[-40, 10], [40, 10], [40, 40], [35, 40], [35, 14], [-35, 14], [-35, 40], [-40, 40]],
+    ],
+)
+def test_corners_of_the_range_lie_on_the_plane_of_a_ring(xy: list, tmp_path: Path):
+    points = [[x, y, 2 + 0.1 * x - 0.05 * y] for x, y in [*xy, xy[0]]]
+    rings = elements(tmp_path, {"label": 1, "points": points}, meta=replace(META, dim=3))
+    for ring in rings:
+        x, y, z = ring.points.T
+        np.testing.assert_allclose(z, 2 + 0.1 * x - 0.05 * y, atol=1e-5)
+        assert np.abs(x).max() <= 30
+        assert np.abs(y).max() <= 15
+
+
+def test_a_corner_inside_of_a_ring_that_is_no_plane_fits_the_cuts_beside_it(tmp_path: Path):
+    """The range cuts off the right and the upper part, with the corner at z = 4.
+
+    (20, 21) 0 ---------- 4 (36, 21)    The best plane is
+             |            |             z = 1 + (x - 28) / 8 + (y - 13) / 8.
+    (20, 15) x- - - + (30, 15)          It is 0.25 m above both cuts, x, whose height is 0,
+             |      |     |             and 1.5 m high at the corner, +, which gets 1.25 m.
+    (20, 5)  0 -----x---- 0 (36, 5)
+    """
+    points = [[20, 5, 0], [36, 5, 0], [36, 21, 4], [20, 21, 0], [20, 5, 0]]
+    (ring,) = elements(tmp_path, {"label": 1, "points": points}, meta=replace(META, dim=3))
+    heights = {(x, y): z for x, y, z in ring.points.tolist()}
+    expected = {(20, 5): 0, (20, 15): 0, (30, 15): 1.25, (30, 5): 0}
+    assert heights == pytest.approx(expected)
+
+
 def test_no_image_outside_of_the_data_root_is_opened(tmp_path: Path):
     root = tmp_path / "root"
     root.mkdir()

@@ -31,7 +31,7 @@ from gsmap.utils.files import file_name
 from gsmap.utils.shards import WHOLE, Shard, digest
 from mapdata.calibrated import calibrated_records, digest_of_calibration
 from mapdata.folders.rig import RigCamera
-from mapdata.local_map import POLYGON, vertices_of
+from mapdata.local_map import POLYGON, lift_corners, vertices_of
 from mapdata.paths import path_below
 
 _LOGGER = logging.getLogger(__name__)
@@ -515,4 +515,6 @@ def _clip(points: Points, label: int, meta: AnnotationMeta) -> list[Points]:
     parts = shapely.get_parts(shapely.intersection(polygon, box))
     # The ring may touch the box in points or lines, which are left out. The cut adds no holes.
     is_area = (shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)
-    return vertices_of(shapely.get_exterior_ring(parts[is_area]), dim=meta.dim)
+    areas = parts[is_area]
+    areas = lift_corners(areas, polygons=np.full(len(areas), polygon), rectangle=box)
+    return vertices_of(shapely.get_exterior_ring(areas), dim=meta.dim)

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 import shapely
 
-from gsmap.structures.polylines import Points, clip_to_box
+from gsmap.structures.polylines import Points, arc_lengths, clip_to_box
 from gsmap.utils.errors import InputError
 
 # Kinds of geometries, as numbered by ``shapely.get_type_id``.
@@ -149,6 +149,64 @@ def vertices_of(lines: Sequence[shapely.Geometry] | np.ndarray, dim: int) -> lis
         return []
     starts = np.flatnonzero(np.diff(owner)) + 1
     return np.split(points, starts)
+
+
+def lift_corners(
+    pieces: np.ndarray, polygons: np.ndarray, rectangle: shapely.Polygon
+) -> np.ndarray:
+    """Set the heights of corners of a rectangle to which polygons with heights were clipped.
+
+    Where an edge of a polygon is cut, shapely interpolates its height. At a corner of the rectangle
+    inside of a polygon, it takes a mean of other heights. Here, the corner gets the height of the
+    plane that fits the vertices of the polygon best. The distance in height from the clipped
+    outline to this plane is interpolated along the outline and added.
+
+    Args:
+        pieces: Polygons inside the rectangle, in metres. (n,)
+        polygons: Polygon of each piece before it was clipped. (n,)
+        rectangle: The rectangle, of which the pieces have exact corners.
+
+    Returns:
+        Pieces with new heights at the corners. Polygons without heights do not change. (n,)
+    """
+    corners = shapely.get_coordinates(rectangle)[:-1]  # (4, 2)
+    is_inside = shapely.contains_properly(polygons[:, None], shapely.points(corners))  # (n, 4)
+    is_lifted = is_inside.any(axis=1) & shapely.has_z(polygons)
+    lifted = pieces.copy()
+    for index in np.flatnonzero(is_lifted).tolist():
+        lifted[index] = _lift_piece(
+            pieces[index], polygon=polygons[index], corners=corners[is_inside[index]]
+        )
+    return lifted
+
+
+def _lift_piece(
+    piece: shapely.Polygon, polygon: shapely.Polygon, corners: np.ndarray
+) -> shapely.Polygon:
+    """Set the heights of a clipped polygon at corners of the rectangle. (n, 2)"""
+    outline = shapely.get_coordinates(piece.exterior, include_z=True)[:-1]  # (m, 3)
+    vertices = shapely.get_coordinates(polygon, include_z=True)
+    vertices = np.unique(vertices, axis=0)  # without the second end of each ring (k, 3)
+    is_corner = (outline[:, None, :2] == corners).all(axis=-1).any(axis=-1)  # (m,)
+    is_known = ~is_corner
+    if not is_corner.any() or not np.isfinite(vertices).all():
+        return piece
+    # The origin is moved to the vertices, as coordinates of maps are large.
+    origin = vertices.mean(axis=0)
+    offsets = vertices - origin
+    slopes = np.linalg.lstsq(offsets[:, :2], offsets[:, 2], rcond=None)[0]
+    heights = origin[2] + (outline[:, :2] - origin[:2]) @ slopes  # of the plane (m,)
+    if is_known.any():
+        ring = np.concatenate([outline, outline[:1]])
+        lengths = arc_lengths(ring)
+        heights += np.interp(
+            lengths[:-1],
+            lengths[:-1][is_known],
+            (outline[:, 2] - heights)[is_known],
+            period=lengths[-1],
+        )
+    outline[is_corner, 2] = heights[is_corner]
+    return shapely.Polygon(outline, holes=piece.interiors)
 
 
 def rings_of(polygons: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import shapely
 
-from mapdata.local_map import POLYGON, LocalPatch
+from mapdata.local_map import POLYGON, LocalPatch, lift_corners
 
 DUPLICATE_IOU = 0.9  # smallest IoU of the strips around two lines that are duplicates
 DUPLICATE_BUFFER_M = 1.0  # half the width of these strips
@@ -39,8 +39,14 @@ def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, 
     # polygon only touches the patch.
     pieces, owner = shapely.get_parts(clipped, return_index=True)
     is_polygon = (shapely.get_type_id(pieces) == POLYGON) & shapely.is_valid(pieces)
-    pieces = patch.to_frame(pieces[is_polygon])
+    pieces = pieces[is_polygon]
     owner = owner[is_polygon]
+    lifted = lift_corners(pieces, polygons=polygons[owner], rectangle=patch.polygon)
+    pieces = patch.to_frame(pieces)
+    # x and y are those of the published ground truth, which depend a little on the heights before.
+    points = shapely.get_coordinates(pieces, include_z=True)
+    points[:, 2] = shapely.get_coordinates(patch.to_frame(lifted), include_z=True)[:, 2]
+    pieces = shapely.set_coordinates(pieces, points)
     is_valid = shapely.is_valid(pieces)  # the transform may round a thin piece to an invalid one
     return pieces[is_valid], owner[is_valid]
 
