@@ -17,7 +17,7 @@ default_hooks = dict(
         save_best='chamfer/mAP',  # of the validations
         rule='greater'),
     sampler_seed=dict(type='DistSamplerSeedHook'),
-    sync_buffers=dict(type='SyncBuffersHook'),  # every rank validates the model that is saved
+    sync_buffers=dict(type='MapSyncBuffersHook'),  # every rank validates the model that is saved
     visualization=dict(type='MapVisualizationHook', draw=True, num_val_samples=2))
 custom_hooks = [dict(type='RunSummaryHook'), dict(type='RigFitHook'), dict(type='GaussianHealthHook')]
 val_evaluator = dict(type='MapMetric', eval=['chamfer'])

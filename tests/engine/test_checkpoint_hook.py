@@ -25,6 +25,7 @@ from torch.utils.data import BatchSampler, ConcatDataset
 import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.reading import read_checked
 from gsmap.checkpoints.safe_globals import mmengine_globals
+from gsmap.engine import checkpoint_hook, resuming
 from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
 from gsmap.engine.resuming import check_optimizer_state
 from gsmap.engine.run_log import MapRunner
@@ -481,6 +482,37 @@ def test_a_resumed_run_with_larger_batches_counts_its_own_iterations(tmp_path):
     log = "".join(path.read_text() for path in tmp_path.glob("*/*.log"))
     assert "after 24 iterations, and this run has 2 in each epoch" in log
     assert "goes on after iteration 6" in log
+
+
+def test_schedules_over_epochs_fit_epochs_of_another_length():
+    """From 4 to 2 iterations in an epoch; a warm-up counts iterations and stays."""
+    cosine = {"begin": 0, "end": 24, "T_max": 24, "last_step": 8, "_global_step": 9, "eta_min": 1}
+    warm_up = {"begin": 0, "end": 500, "last_step": 8, "_global_step": 9}
+    endless = {"begin": 4, "end": 10**9, "last_step": 8, "gamma": 0.1}
+    checkpoint = {"param_schedulers": [dict(warm_up), dict(cosine), dict(endless)]}
+    by_epoch = {"by_epoch": True, "convert_to_iter_based": True}
+    resuming.fit_schedules(checkpoint, [{"by_epoch": False}, by_epoch, by_epoch], ratio=0.5)
+    assert checkpoint["param_schedulers"] == [
+        warm_up,
+        {"begin": 0, "end": 12, "T_max": 12, "last_step": 4, "_global_step": 4, "eta_min": 1},
+        {"begin": 2, "end": 10**9, "last_step": 4, "gamma": 0.1},
+    ]
+    for others in (None, [], [by_epoch]):  # not of this checkpoint
+        kept = {"param_schedulers": [dict(cosine), dict(warm_up)]}
+        resuming.fit_schedules(kept, others, ratio=0.5)
+        assert kept["param_schedulers"] == [cosine, warm_up]
+
+
+def test_ranks_that_begin_differently_are_refused(tmp_path, monkeypatch):
+    """As on two machines that do not share the work folder."""
+    learn(tmp_path, 1)
+    monkeypatch.setattr(checkpoint_hook, "all_gather_object", lambda value: [value, value])
+    assert learn(tmp_path, 2, tmp_path / "epoch_1.pth") == 1
+    other = "iteration 0 (no checkpoint)"
+    monkeypatch.setattr(checkpoint_hook, "all_gather_object", lambda value: [value, other])
+    text = r"rank 0 begins at iteration 2 \(epoch_1\.pth\), but rank 1 at iteration 0 .*one folder"
+    with pytest.raises(ValueError, match=text):
+        learn(tmp_path, 3, tmp_path / "epoch_1.pth")
 
 
 @pytest.mark.parametrize(

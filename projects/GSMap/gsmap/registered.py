@@ -20,6 +20,7 @@ MODULES = (
     "gsmap.engine.log_processor",
     "gsmap.engine.optimizers",
     "gsmap.engine.run_log",
+    "gsmap.engine.sync_buffers",
     "gsmap.evaluation.gaussian_metric",
     "gsmap.evaluation.map_metric",
     "gsmap.models.data_preprocessor",

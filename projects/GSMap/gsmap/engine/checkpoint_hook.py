@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import HOOKS
-from mmengine.dist import all_gather_object
+from mmengine.dist import all_gather_object, broadcast_object_list
 from mmengine.fileio import LocalBackend, register_backend
 from mmengine.hooks import CheckpointHook
 from mmengine.optim import OptimWrapper
@@ -34,6 +34,7 @@ from gsmap.engine.resuming import (
     check_readable,
     check_resumable,
     drop_functions,
+    fit_schedules,
     ignored_settings,
     refusing_state,
 )
@@ -108,6 +109,23 @@ def _resume_sampler_seed(runner: Runner, seed: int | None) -> None:
     for sampler in samplers:
         if seed is not None and getattr(sampler, "seed", None) == runner.seed:
             sampler.seed = seed
+
+
+def _require_equal_starts(runner: Runner) -> None:
+    """Require that all ranks begin at one iteration, from checkpoints of one name.
+
+    Raises:
+        ValueError: If they do not. The gradients would be means over different models.
+    """
+    source = Path(str(runner._load_from)).name if runner._load_from else "no checkpoint"
+    starts = all_gather_object(f"iteration {runner.iter} ({source})")
+    for rank, start in enumerate(starts):
+        if start != starts[0]:
+            raise InputError(
+                f"rank 0 begins at {starts[0]}, but rank {rank} at {start}: {runner.work_dir} must "
+                "be one folder for all machines, and show them the same files; --resume CHECKPOINT "
+                "names one for all."
+            )
 
 
 def _described_datasets(runner: Runner) -> list[Any]:
@@ -240,12 +258,8 @@ class AtomicCheckpointHook(CheckpointHook):
         if not isinstance(meta, dict):
             meta = {}
         meta.pop("config", None)
-        if "optimizer" in checkpoint and runner._resume:
-            self._fit_optimizer(runner, checkpoint=checkpoint)
         if runner._resume:
-            _resume_sampler_seed(runner, seed=meta.get("seed"))
-            self._resume_iterations(runner, meta=meta)
-            self._resumed_state = resumed_random_state(checkpoint=checkpoint, runner=runner)
+            self._fit_to_run(runner, checkpoint=checkpoint, meta=meta)
         trained_meta = meta.get("dataset_meta")
         if isinstance(trained_meta, dict):
             # A loop is None if the run does not have it, or a dict if mmengine has not built it.
@@ -255,10 +269,31 @@ class AtomicCheckpointHook(CheckpointHook):
         if isinstance(runner._test_loop, BaseLoop):
             _pass_model_facts(runner._test_loop, path=Path(str(source)), meta=meta)
 
-    def _resume_iterations(self, runner: Runner, meta: dict[str, Any]) -> None:
+    def _fit_to_run(self, runner: Runner, checkpoint: dict[str, Any], meta: dict[str, Any]) -> None:
+        """Adapt the progress, the schedules and the optimizer state of a checkpoint, in place.
+
+        Args:
+            runner: The resumed run.
+            checkpoint: The checkpoint.
+            meta: Metadata of the checkpoint.
+        """
+        _resume_sampler_seed(runner, seed=meta.get("seed"))
+        self._resume_iterations(runner, checkpoint=checkpoint, meta=meta)
+        if "optimizer" in checkpoint:
+            self._fit_optimizer(runner, checkpoint=checkpoint)
+        self._resumed_state = resumed_random_state(checkpoint=checkpoint, runner=runner)
+
+    def _resume_iterations(
+        self, runner: Runner, checkpoint: dict[str, Any], meta: dict[str, Any]
+    ) -> None:
         """Convert the number of iterations of a checkpoint to the length of this run's epochs.
 
         Epochs have another length with another batch size, data set or number of processes.
+
+        Args:
+            runner: The resumed run.
+            checkpoint: The checkpoint, whose schedules are converted in place, too.
+            meta: Metadata of the checkpoint, converted in place.
         """
         self._saved_iter = meta["iter"]
         loop = runner.train_loop
@@ -270,6 +305,9 @@ class AtomicCheckpointHook(CheckpointHook):
                 f"{runner._load_from} was saved after {meta['iter']} iterations, and this run has "
                 f"{len(loop.dataloader)} in each epoch (another batch size, data set or number of "
                 f"processes), so it goes on after iteration {iterations}."
+            )
+            fit_schedules(
+                checkpoint, runner.cfg.get("param_scheduler"), iterations / max(meta["iter"], 1)
             )
             meta["iter"] = iterations
 
@@ -368,8 +406,10 @@ class AtomicCheckpointHook(CheckpointHook):
         """Prepare the training, and run a validation that was due when the run was interrupted.
 
         Raises:
-            ValueError: If the validation data are from another split than the training data.
+            ValueError: If the validation data are from another split than the training data, or the
+                ranks begin differently.
         """
+        _require_equal_starts(runner)
         super().before_train(runner)  # restores the paths of the best checkpoints when resuming
         self._forget_foreign_best(runner)
         _warn_of_differences(runner)
@@ -391,8 +431,9 @@ class AtomicCheckpointHook(CheckpointHook):
         is_due = has_begun and is_at_interval
         marker = Path(runner.work_dir, VALIDATED)
         saved_iter = runner.iter if self._saved_iter is None else self._saved_iter
-        is_validated = marker.exists() and read_text(marker) == str(saved_iter)
-        if is_due and runner.val_loop is not None and not is_validated:
+        is_validated = [marker.exists() and read_text(marker) == str(saved_iter)]
+        broadcast_object_list(is_validated)  # the first rank has written the file
+        if is_due and runner.val_loop is not None and not is_validated[0]:
             runner.logger.info("The run was cut off before its validation, which is run now.")
             runner.val_loop.run()
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
+from mmengine.dist import all_reduce
 from mmengine.optim import AmpOptimWrapper, DefaultOptimWrapperConstructor, OptimWrapper
 from mmengine.registry import OPTIM_WRAPPER_CONSTRUCTORS, OPTIM_WRAPPERS, OPTIMIZERS
 from torch import Tensor, nn
@@ -62,8 +63,8 @@ class MapOptimWrapper(_LateNorm):
     """mmengine's `OptimWrapper` without GPU synchronisation.
 
     On a GPU, the model detects a loss that is not finite only one step later (`LossCheck`). Until
-    then a fused optimizer skips its steps, so the weights stay unchanged. On a CPU, the model
-    raises the error in the step of the loss.
+    then a fused optimizer skips its steps, on all ranks if the loss of one is not finite, so the
+    weights stay unchanged. On a CPU, the model raises the error in the step of the loss.
     """
 
     # On a GPU, 1.0 if a loss since the last step is not finite, and 0.0 otherwise. There are
@@ -94,6 +95,8 @@ class MapOptimWrapper(_LateNorm):
         # attribute for its gradient scaler, hence the name of the flag that shows the support.
         can_skip_steps = getattr(self.optimizer, "_step_supports_amp_scaling", False)
         if can_skip_steps and self._has_nonfinite_loss is not None:
+            # The gradients are means over the ranks, so one loss makes those of all ranks NaN.
+            all_reduce(self._has_nonfinite_loss, op="max")
             self.optimizer.found_inf = self._has_nonfinite_loss
         super().step(**kwargs)
         self._has_nonfinite_loss = None

@@ -25,6 +25,7 @@ _HUB_KEYS = ("log_scalars", "runtime_info", "resumed_keys")
 # Parts of a checkpoint to which data sets, hooks and schedules of a user add entries
 _OPEN_PARTS = ("meta", "message_hub", "param_schedulers")
 _SEED_COUNT = 2**32  # seeds that numpy accepts
+_ENDLESS = 10**9  # end of a schedule without an end, in mmengine
 # Entries of the state of a schedule that are no settings: its progress and its values so far.
 _SCHEDULE_PROGRESS = {"last_step", "_global_step", "_last_value", "base_values", "verbose"}
 
@@ -178,6 +179,29 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
             if not _fits(value, parameter=parameter):
                 reason = f"its optimizer has a {name!r:.40} that does not fit its parameter"
                 raise refusal(path, reason=reason)
+
+
+def fit_schedules(checkpoint: Mapping[str, Any], configs: Any, ratio: float) -> None:
+    """Convert schedules of a checkpoint to epochs of another length, in place.
+
+    A schedule over epochs with ``convert_to_iter_based`` counts iterations in its state. Others are
+    not changed: they count epochs, or iterations by their config.
+
+    Args:
+        checkpoint: Content of the checkpoint.
+        configs: Schedules in the config of the run, in the order of those of the checkpoint.
+        ratio: Length of an epoch in the run, relative to that in the checkpoint.
+    """
+    states = checkpoint.get("param_schedulers")
+    if not isinstance(states, list) or not isinstance(configs, list) or len(states) != len(configs):
+        return
+    for state, config in zip(states, configs, strict=True):
+        if not config.get("convert_to_iter_based") or not isinstance(state, dict):
+            continue
+        for name in ("begin", "end", "T_max", "last_step", "_global_step"):
+            value = state.get(name)
+            if type(value) is int and value < _ENDLESS:
+                state[name] = round(value * ratio)
 
 
 def ignored_settings(checkpoint: Mapping[str, Any], runner: Runner) -> list[str]:
