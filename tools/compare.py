@@ -21,7 +21,7 @@ import gsmap  # noqa: F401
 import argparse
 import shlex
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -249,6 +249,29 @@ def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
     return f"{tables}\nwritten to {args.out}"
 
 
+def rate_note(runs: Sequence[Run], batch: int) -> str:
+    """Describe learning rates that are for different batch sizes; empty if there is one size.
+
+    A comparison uses the rates of the configs as they are.
+
+    Args:
+        runs: Planned runs.
+        batch: Number of samples of an iteration.
+    """
+    names_of: dict[int, list[str]] = {}  # names of configs by the batch size of their rates
+    for run in runs:
+        size = (run.settings["auto_scale_lr"] or {}).get("base_batch_size")
+        if size and run.name not in names_of.setdefault(size, []):
+            names_of[size].append(run.name)
+    if len(names_of) < 2:
+        return ""
+    texts = [f"{size} ({', '.join(names)})" for size, names in sorted(names_of.items())]
+    return (
+        f"note: learning rates are those of the configs, for batches of {' and '.join(texts)}; "
+        f"here a batch has {batch}. optim_wrapper.optimizer.lr sets another one."
+    )
+
+
 def main() -> str:
     args = parse_args()
     if args.list:
@@ -266,6 +289,8 @@ def main() -> str:
         )
         entries = [parse_entry(text) for text in args.configs]
         runs = plan(entries, protocol)
+        if not args.slurm and (note := rate_note(runs, args.batch)):
+            print(note)
     # Without --only, `args.only` is None, and all runs are chosen.
     chosen = [run for run in runs if args.only in (None, run.label)]
     if args.only and not chosen:

@@ -22,6 +22,7 @@ from gsmap.engine.torchrun import OWN_WORDS
 from gsmap.evaluation.core.results_json import write_results
 from gsmap.utils.faults import user_message
 from tools.compare import main as compare
+from tools.compare import rate_note
 
 CLASSES = ("divider", "boundary")
 
@@ -58,6 +59,17 @@ def test_runs_are_planned_with_one_budget_seed_by_seed(tiny_config, protocol):
     assert runs[3].settings["randomness"]["seed"] == 1
     assert runs[3].settings["optim_wrapper"]["optimizer"]["lr"] == 1
     assert not protocol.out.exists()  # nothing is written yet
+
+
+def test_learning_rates_for_different_batches_are_named(tiny_config, protocol):
+    rate = "optim_wrapper.optimizer.lr=1"
+    runs = plan(entries(tiny_config, "a=CONFIG", f"b=CONFIG,{rate}"), protocol)
+    assert rate_note(runs, batch=2) == ""
+    size = "auto_scale_lr.base_batch_size"
+    texts = [f"a=CONFIG,{size}=32", f"b=CONFIG,{size}=16", f"c=CONFIG,{rate},{size}=16"]
+    runs = plan(entries(tiny_config, *texts), protocol)
+    note = rate_note(runs, batch=2)
+    assert "for batches of 16 (b, c) and 32 (a); here a batch has 2" in note
 
 
 @pytest.mark.parametrize(

@@ -24,12 +24,12 @@ class GatheredMetric(BaseMetric):
         Returns:
             Figures by name, with the prefix of the metric; equal on all ranks.
         """
-        parts: list[list[Any]] = all_gather_object(self.results)  # type: ignore[has-type]
+        parts = all_gather_object(self.results)
         figures: list[Any] = [None]
         if is_main_process():
             computed = self.compute_metrics(list(chain.from_iterable(parts)))
             prefix = f"{self.prefix}/" if self.prefix else ""
             figures = [{f"{prefix}{name}": value for name, value in computed.items()}]
         broadcast_object_list(figures)
-        self.results = []
+        self.results.clear()
         return figures[0]
