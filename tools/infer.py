@@ -15,8 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from gsmap.apis.result_log import ResultLog
 from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -47,6 +45,7 @@ from mapdata.inputs import open_input
 from mapdata.options import InputOptions
 
 if TYPE_CHECKING:  # slow to import
+    import numpy as np
     from mmdet3d.structures import Det3DDataSample
 
     from gsmap import MapInferencer
@@ -262,12 +261,12 @@ def require_own_samples(path: Path) -> None:
 
 
 def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
-    """Print warnings about implausible properties of the cameras and the poses.
+    """Print warnings about implausible properties of the cameras, and about the poses.
 
     With ``--check-calibration``, also draw the ground plane over the images of the first drive.
 
     Returns:
-        The warnings.
+        The warnings about the cameras.
     """
     samples = first_samples(source.samples)
     root = source.data_root or Path()
@@ -278,10 +277,8 @@ def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
     for line in warnings:
         print(f"calibration: {line}")
     if source.has_poses:
-        lines = pose_warnings(source.samples, source.frame)
-        for line in lines:
+        for line in pose_warnings(source.samples, source.frame):
             print(f"poses: {line}")
-        warnings += lines
     if args.check_calibration:
         figure = calibration_figure(samples[0], source.frame, root, source.ground_z_m)
         path = save_figure(figure, args.check_calibration)
@@ -388,7 +385,7 @@ def predict(
     chosen: list[int],
     results: ResultLog | None,
     priors: Sequence["AnyPrior"],
-    input_from_model: Mapping[str, np.ndarray],
+    input_from_model: "Mapping[str, np.ndarray]",
 ) -> dict[str, str]:
     """Predict samples, draw them and log the predictions.
 
@@ -454,7 +451,7 @@ def predict(
 
 def transforms_to_input(
     source: Source, dataset: "VectorizedMapDataset", mount: Mount
-) -> dict[str, np.ndarray]:
+) -> "dict[str, np.ndarray]":
     """Transforms from the frame of the model to the frame of the samples of an annotation file.
 
     Results of an annotation file belong to this file. Of other inputs, the samples in the frame of

@@ -61,7 +61,7 @@ WRONG = {
         "180 degrees",
     ),
     "millimetres": (lambda pose: rigid(pose[:3, :3], 1000 * pose[:3, 3]), "faster than 100 m/s"),
-    "missing": (lambda pose: np.eye(4), "poses of all 20 samples are equal"),
+    "missing": (lambda pose: np.eye(4), "poses of all 20 samples are the identity"),
     "turned round": (lambda pose: turned(pose, pose[:3, :3] @ QUARTER @ QUARTER), "backwards"),
 }
 
@@ -82,7 +82,7 @@ def test_wrong_times_and_jumps_are_noticed():
     (line,) = pose_warnings(too_fast, "ego")
     assert line.startswith("19 of 19 steps are faster than 100 m/s")
     (line,) = pose_warnings([replace(s, timestamp_ns=-s.timestamp_ns) for s in samples], "ego")
-    assert line.startswith("the vehicle moves backwards (median of 19 steps)")
+    assert line.startswith("the vehicle moves backwards in drive 'drive' of 1 drive: unless it")
     # Two drives under one name, one after the other.
     second = with_poses(circle(), lambda pose: rigid(np.eye(3), [700.0, 0.0, 0.0]) @ pose)
     later = [
@@ -92,6 +92,28 @@ def test_wrong_times_and_jumps_are_noticed():
     (line,) = pose_warnings(samples + later, "ego")
     assert line.startswith("the vehicle jumps 1 time, such as by 6")
     assert "from sample 'drive19' to 'drive0b', in drive 'drive' of 1 drive: is it one" in line
+
+
+def test_a_drive_in_reverse_is_not_called_inverted():
+    """Odometry that starts at the origin, where inverted poses look like a drive in reverse."""
+    samples = []
+    for number, sample in enumerate(circle()):
+        pose = rigid(np.eye(3), [-2.0 * number, 0.0, 0.0])
+        samples.append(replace(sample, global_from_frame=pose))
+    (line,) = pose_warnings(samples, "ego")
+    assert "backwards" in line
+    assert "inverted" not in line
+
+
+def test_short_steps_of_a_fast_camera_add_up():
+    """30 frames a second at 10 m/s, 0.33 m each."""
+    check = MotionCheck()
+    for number in range(300):
+        pose = rigid(np.eye(3), [0.0, number / 3, 0.0])  # x is ahead
+        check.add("drive", number * 33_333_333, str(number), pose, ground_from_frame=np.eye(4))
+    assert check.num_steps == 149
+    (line,) = check.warnings()
+    assert "90 degrees sideways (median of 149 steps)" in line
 
 
 def test_a_file_has_one_line_for_each_kind_of_fault():
@@ -113,7 +135,8 @@ def test_what_says_nothing_about_the_motion_is_no_fault():
     corrected = list(samples)
     shift = rigid(np.eye(3), [8.0, 0.0, 0.0])  # the localisation corrects its position by 8 m
     corrected[10:] = with_poses(samples[10:], lambda pose: shift @ pose)
-    for found in (single_scene, at_one_time, standing, corrected, samples[:1], []):
+    parked = with_poses(samples, lambda pose: samples[0].global_from_frame)  # not a missing pose
+    for found in (single_scene, at_one_time, standing, parked, corrected, samples[:1], []):
         assert pose_warnings(found, "ego") == []
     # The order of the samples does not count.
     assert pose_warnings(samples[::-1], "ego") == []

@@ -171,7 +171,7 @@ def test_long_straight_lines_and_wide_areas_in_view_are_compared():
     new = find_changes(map_of([(0, beside(0, 0.2))]), [Pass(drive, map_of([(0, long)]))])
     assert summarize_changes(new) == "0 removed, 2 added, 0 moved"  # before and after it
     lines_only = find_changes(map_of([(0, long)]), [Pass(drive, map_of([(0, long), (1, ring)]))])
-    text = "0 removed, 1 added, 0 moved; the old map has no ped_crossing at all, so 1 ped_crossing"
+    text = "0 removed, 1 added, 0 moved; the old map has no ped_crossing at all, so all of its 1"
     assert summarize_changes(lines_only) == f"{text} count as added"
 
 

@@ -17,6 +17,7 @@ from mmengine.evaluator import BaseMetric, Evaluator
 from mmengine.fileio import get_file_backend
 from mmengine.logging import MessageHub
 from mmengine.model import BaseModel
+from mmengine.registry import PARAM_SCHEDULERS
 from mmengine.runner import BaseLoop
 from mmengine.runner.checkpoint import save_checkpoint
 from processes import run_python
@@ -484,23 +485,48 @@ def test_a_resumed_run_with_larger_batches_counts_its_own_iterations(tmp_path):
     assert "goes on after iteration 6" in log
 
 
-def test_schedules_over_epochs_fit_epochs_of_another_length():
-    """From 4 to 2 iterations in an epoch; a warm-up counts iterations and stays."""
-    cosine = {"begin": 0, "end": 24, "T_max": 24, "last_step": 8, "_global_step": 9, "eta_min": 1}
+@pytest.mark.parametrize(
+    "schedule",
+    [
+        {"type": "CosineAnnealingLR", "T_max": 24},
+        {"type": "MultiStepLR", "milestones": [20]},
+        {"type": "StepLR", "step_size": 8},
+        {"type": "LinearLR", "start_factor": 0.1, "end": 24},
+    ],
+)
+@pytest.mark.parametrize("lengths", [(4, 2), (2, 4)])
+def test_schedules_over_epochs_fit_epochs_of_another_length(schedule, lengths):
+    """A training of 24 epochs is stopped after 12, and resumed with epochs of another length."""
+
+    def build(epoch_length):
+        optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+        settings = {**schedule, "by_epoch": True, "convert_to_iter_based": True}
+        settings |= {"optimizer": optimizer, "epoch_length": epoch_length}
+        return optimizer, PARAM_SCHEDULERS.build(settings)
+
+    def run(optimizer, scheduler, iterations):
+        for _ in range(iterations):
+            optimizer.step()
+            scheduler.step()
+        return optimizer.param_groups[0]["lr"]
+
+    before, after = lengths
+    optimizer, scheduler = build(before)
+    rate = run(optimizer, scheduler, 12 * before)
     warm_up = {"begin": 0, "end": 500, "last_step": 8, "_global_step": 9}
-    endless = {"begin": 4, "end": 10**9, "last_step": 8, "gamma": 0.1}
-    checkpoint = {"param_schedulers": [dict(warm_up), dict(cosine), dict(endless)]}
-    by_epoch = {"by_epoch": True, "convert_to_iter_based": True}
-    resuming.fit_schedules(checkpoint, [{"by_epoch": False}, by_epoch, by_epoch], ratio=0.5)
-    assert checkpoint["param_schedulers"] == [
-        warm_up,
-        {"begin": 0, "end": 12, "T_max": 12, "last_step": 4, "_global_step": 4, "eta_min": 1},
-        {"begin": 2, "end": 10**9, "last_step": 4, "gamma": 0.1},
-    ]
-    for others in (None, [], [by_epoch]):  # not of this checkpoint
-        kept = {"param_schedulers": [dict(cosine), dict(warm_up)]}
-        resuming.fit_schedules(kept, others, ratio=0.5)
-        assert kept["param_schedulers"] == [cosine, warm_up]
+    checkpoint = {"param_schedulers": [dict(warm_up), scheduler.state_dict()]}
+    configs = [{"by_epoch": False}, {"by_epoch": True, "convert_to_iter_based": True}]
+    resuming.fit_schedules(checkpoint, configs, ratio=after / before)
+    assert checkpoint["param_schedulers"][0] == warm_up
+    resumed, going_on = build(after)
+    resumed.param_groups[0]["lr"] = rate
+    going_on.load_state_dict(checkpoint["param_schedulers"][1])
+    end = run(resumed, going_on, 12 * after)
+    whole, whole_schedule = build(after)
+    assert end == pytest.approx(run(whole, whole_schedule, 24 * after), abs=0.05)
+    kept = {"param_schedulers": [dict(warm_up)]}
+    resuming.fit_schedules(kept, configs, ratio=0.5)  # schedules of another config
+    assert kept["param_schedulers"] == [warm_up]
 
 
 def test_ranks_that_begin_differently_are_refused(tmp_path, monkeypatch):

@@ -73,7 +73,7 @@ def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, 
         values.update(scene="drive", timestamp_ns=time_ns, global_from_frame=np.eye(4))
     from_records(wrong, equal, meta, tmp_path)
     text = check_files([wrong], None, workers=1)
-    assert "warning: poses: the poses of all 2 samples are equal in drive 'drive'" in text
+    assert "warning: poses: the poses of all 2 samples are the identity in drive 'drive'" in text
     caplog.clear()
     from_records(wrong, [record("a", looking, here)], AnnotationMeta("x", "ego", "v"), tmp_path)
     assert "does not contain the height of the road in the frame 'ego'" in caplog.text

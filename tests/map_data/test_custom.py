@@ -402,9 +402,12 @@ def test_an_ideal_fisheye_is_rectified(tmp_path: Path):
                      tmp_path)  # fmt: skip
         (seen,) = AnnotationFile(tmp_path / "d.arrow")[0].cameras
         assert (seen.path != "a.png") == is_rectified
-    for model, message in (("equidistant", "give its four coefficients"), ("omni", None)):
-        lens = {"distortion_model": model} | ({} if message else {"distortion": [0, 0, 0, 0]})
-        with pytest.raises(ValueError, match=message or "distortion model 'omni'"):
+    for model, numbers, message in (
+        ("equidistant", None, "give its four coefficients"),
+        ("omni", [1, 0, 0, 0], "distortion model 'omni'"),
+    ):
+        lens = {"distortion_model": model, "distortion": numbers}
+        with pytest.raises(ValueError, match=message):
             from_records(tmp_path / "d.arrow", [{"token": "t", "cameras": [camera | lens]}], META,
                          tmp_path)  # fmt: skip
 

@@ -273,5 +273,5 @@ def summarize_changes(found: Changes) -> str:
     if not_compared:
         text += f" (not compared: {'; '.join(not_compared)})"
     for name, count in sorted(found.num_of_absent_classes.items()):
-        text += f"; the old map has no {name} at all, so {count} {name} count as added"
+        text += f"; the old map has no {name} at all, so all of its {count} count as added"
     return text

@@ -214,12 +214,12 @@ def test_poses_are_checked_beside_the_calibration(town, tmp_path, capsys):
             sample = replace(town[0], token=str(number), timestamp_ns=time_ns)
             samples.append(replace(sample, global_from_frame=pose))
         source = Source(samples, "lidar", data_root=tmp_path)
-        found = infer.check_calibration(Namespace(check_calibration=None), source)
-        assert len(found) == is_wrong
+        assert infer.check_calibration(Namespace(check_calibration=None), source) == []
         printed = capsys.readouterr().out
         assert ("poses: the vehicle moves 90 degrees sideways" in printed) == is_wrong
         without = replace(source, has_poses=False)
-        assert infer.check_calibration(Namespace(check_calibration=None), without) == []
+        infer.check_calibration(Namespace(check_calibration=None), without)
+        assert capsys.readouterr().out == ""
 
 
 def test_the_ground_is_drawn_where_the_cameras_see_it(town, minicity_root):

@@ -79,8 +79,11 @@ def test_zeros_of_a_plain_lens_are_a_pinhole_and_a_fisheye_needs_its_coefficient
         assert not camera.is_distorted
     with pytest.raises(ValueError, match="but no distortion: give its four coefficients"):
         RigCamera("a", intrinsics, np.eye(4), size_px, np.zeros(0), "equidistant")
-    with pytest.raises(ValueError, match="distortion model 'omni'; known are"):
-        RigCamera("a", intrinsics, np.eye(4), size_px, np.zeros(4), "omni")
+    for model in ("none", "pinhole", "omni"):  # names of rectified images
+        camera = RigCamera("a", intrinsics, np.eye(4), size_px, np.zeros(4), model)
+        assert not camera.is_distorted
+        with pytest.raises(ValueError, match=f"distortion model {model!r}; known are"):
+            RigCamera("a", intrinsics, np.eye(4), size_px, np.ones(4), model)
     # A ray at 30 degrees from the axis meets r = f theta in the image, f tan(theta) afterwards.
     camera = RigCamera("a", intrinsics, np.eye(4), size_px, np.zeros(4), "equidistant")
     image = np.zeros((120, 160, 3), np.uint8)

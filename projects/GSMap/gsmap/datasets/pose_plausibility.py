@@ -23,16 +23,25 @@ _MAX_SPEED_M_S = 100.0
 _MIN_JUMP_M = 10.0  # shorter jumps are corrections of a localisation
 
 _Fault = tuple[str, str]  # description, and the likely cause
+_BACKWARDS: _Fault = (
+    "the vehicle moves backwards",
+    "unless it drives in reverse: does x of the ground point ahead, and does time go forward?",
+)
 
 
 @dataclass
 class _Drive:
-    """Poses of a drive, in the order in which they were added."""
+    """Poses of a drive, in the order in which they were added.
+
+    Attributes:
+        place: Position of the last pose that is at least 0.5 m from the one before it. (3,)
+    """
 
     times_ns: list[int] = field(default_factory=list)
     tokens: list[str] = field(default_factory=list)
     global_from_frame: list[np.ndarray] = field(default_factory=list)  # (4, 4) each
     frame_from_ground: list[np.ndarray] = field(default_factory=list)  # (4, 4) each
+    place: np.ndarray | None = None
 
 
 class MotionCheck:
@@ -40,7 +49,7 @@ class MotionCheck:
 
     Attributes:
         num_poses: Number of added poses.
-        num_steps: Number of added poses that are at least 0.5 m from the pose before them.
+        num_steps: Number of steps of at least 0.5 m.
     """
 
     def __init__(self) -> None:
@@ -68,9 +77,12 @@ class MotionCheck:
                 vehicle (x ahead, y left, z up). (4, 4)
         """
         poses = self._drives.setdefault(drive, _Drive())
-        if poses.global_from_frame:
-            step = global_from_frame[:3, 3] - poses.global_from_frame[-1][:3, 3]
-            self.num_steps += bool(np.linalg.norm(step) >= _MIN_STEP_M)
+        position = global_from_frame[:3, 3]
+        if poses.place is None:
+            poses.place = position
+        elif np.linalg.norm(position - poses.place) >= _MIN_STEP_M:
+            poses.place = position
+            self.num_steps += 1
         self.num_poses += 1
         poses.times_ns.append(timestamp_ns)
         poses.tokens.append(token)
@@ -122,11 +134,13 @@ def _faults_of(name: str, drive: _Drive) -> list[_Fault]:
     global_from_frame = np.stack(drive.global_from_frame)[order]
     frame_from_ground = np.stack(drive.frame_from_ground)[order]
     poses = global_from_frame @ frame_from_ground
-    faults = list(_tilt_faults(poses)) + list(_equality_faults(poses))
+    faults = list(_tilt_faults(poses)) + list(_identity_faults(global_from_frame))
     # Without names or times of drives, the order of the poses is not known.
     if faults or not name or times_s[-1] == 0:
         return faults
     faults = list(_motion_faults(times_s, tokens, poses))
+    if faults == [_BACKWARDS]:  # it may be a drive in reverse, not an inverted pose
+        return faults
     inverse = invert_rigid(global_from_frame) @ frame_from_ground
     has_moved = np.ptp(poses[:, :3, 3], axis=0).max() >= _MIN_STEPS * _MIN_STEP_M
     if faults and has_moved and not list(_motion_faults(times_s, tokens, inverse)):
@@ -150,11 +164,11 @@ def _tilt_faults(poses: np.ndarray) -> Iterator[_Fault]:
         )
 
 
-def _equality_faults(poses: np.ndarray) -> Iterator[_Fault]:
-    """Yield a fault if the poses of several samples are equal. (n, 4, 4)"""
-    if len(poses) > 1 and (poses == poses[0]).all():
+def _identity_faults(poses: np.ndarray) -> Iterator[_Fault]:
+    """Yield a fault if the poses of several samples are the identity. (n, 4, 4)"""
+    if len(poses) > 1 and (poses == np.eye(4)).all():
         yield (
-            f"the poses of all {len(poses)} samples are equal",
+            f"the poses of all {len(poses)} samples are the identity",
             "are poses (global_from_frame) missing? Memory, priors and maps of drives need them",
         )
 
@@ -187,21 +201,33 @@ def _motion_faults(times_s: np.ndarray, tokens: list[str], poses: np.ndarray) ->
             f"{lengths_m[first]:.0f} m from sample {tokens[first]!r} to {tokens[first + 1]!r},",
             "is it one drive, and does each sample have the pose of its time?",
         )
-    is_used = is_step & ~is_jump
-    if is_used.sum() < _MIN_STEPS:
+    yield from _direction_faults(poses)
+
+
+def _direction_faults(poses: np.ndarray) -> Iterator[_Fault]:
+    """Yield a fault if the vehicle does not move where it looks.
+
+    Args:
+        poses: Transforms in metres from the ground below the vehicle to the world. (n, 4, 4)
+    """
+    kept = [0]  # poses at least 0.5 m from the one before them
+    positions = poses[:, :3, 3]
+    for index, position in enumerate(positions):
+        if np.linalg.norm(position - positions[kept[-1]]) >= _MIN_STEP_M:
+            kept.append(index)
+    steps = np.diff(positions[kept], axis=0)
+    if len(steps) < _MIN_STEPS:
         return
     # The vehicle turns during a step: halfway it looks between the directions at both ends.
-    halfway = poses[:-1, :3, :3] + poses[1:, :3, :3]
+    rotations = poses[kept][:, :3, :3]
+    halfway = rotations[:-1] + rotations[1:]
     ahead_m = (steps * halfway[:, :, 0]).sum(axis=1)
     left_m = (steps * halfway[:, :, 1]).sum(axis=1)
-    angle_deg = np.degrees(np.median(np.abs(np.arctan2(left_m, ahead_m)[is_used])))
+    angle_deg = np.degrees(np.median(np.abs(np.arctan2(left_m, ahead_m))))
     if angle_deg > 180.0 - _MAX_SIDEWAYS_DEG:
-        yield (
-            f"the vehicle moves backwards (median of {is_used.sum()} steps)",
-            "does x of the ground point ahead, and does time go forward?",
-        )
+        yield _BACKWARDS
     elif angle_deg > _MAX_SIDEWAYS_DEG:
         yield (
-            f"the vehicle moves {angle_deg:.0f} degrees sideways (median of {is_used.sum()} steps)",
+            f"the vehicle moves {angle_deg:.0f} degrees sideways (median of {len(steps)} steps)",
             "are axes exchanged, or is a quaternion in another order?",
         )

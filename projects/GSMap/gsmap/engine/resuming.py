@@ -25,7 +25,6 @@ _HUB_KEYS = ("log_scalars", "runtime_info", "resumed_keys")
 # Parts of a checkpoint to which data sets, hooks and schedules of a user add entries
 _OPEN_PARTS = ("meta", "message_hub", "param_schedulers")
 _SEED_COUNT = 2**32  # seeds that numpy accepts
-_ENDLESS = 10**9  # end of a schedule without an end, in mmengine
 # Entries of the state of a schedule that are no settings: its progress and its values so far.
 _SCHEDULE_PROGRESS = {"last_step", "_global_step", "_last_value", "base_values", "verbose"}
 
@@ -184,8 +183,9 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
 def fit_schedules(checkpoint: Mapping[str, Any], configs: Any, ratio: float) -> None:
     """Convert schedules of a checkpoint to epochs of another length, in place.
 
-    A schedule over epochs with ``convert_to_iter_based`` counts iterations in its state. Others are
-    not changed: they count epochs, or iterations by their config.
+    A schedule over epochs with ``convert_to_iter_based`` counts iterations in its state. Its
+    progress is converted, and its settings are removed, so that those of the run count. Other
+    schedules are not changed. They count epochs, or iterations that the config gives.
 
     Args:
         checkpoint: Content of the checkpoint.
@@ -198,10 +198,12 @@ def fit_schedules(checkpoint: Mapping[str, Any], configs: Any, ratio: float) -> 
     for state, config in zip(states, configs, strict=True):
         if not config.get("convert_to_iter_based") or not isinstance(state, dict):
             continue
-        for name in ("begin", "end", "T_max", "last_step", "_global_step"):
-            value = state.get(name)
-            if type(value) is int and value < _ENDLESS:
-                state[name] = round(value * ratio)
+        for name in list(state):
+            if name not in _SCHEDULE_PROGRESS:
+                del state[name]
+        for name in ("last_step", "_global_step"):
+            if type(state.get(name)) is int:
+                state[name] = round(state[name] * ratio)
 
 
 def ignored_settings(checkpoint: Mapping[str, Any], runner: Runner) -> list[str]:
@@ -231,7 +233,7 @@ def ignored_settings(checkpoint: Mapping[str, Any], runner: Runner) -> list[str]
         for saved, schedule in zip(states, runner.param_schedulers, strict=False):
             for name, value in schedule.state_dict().items():
                 is_setting = name not in _SCHEDULE_PROGRESS and not callable(value)
-                if is_setting and saved.get(name) != value:
+                if is_setting and saved.get(name, value) != value:
                     kind = type(schedule).__name__
                     texts.append(f"{kind}.{name} {saved.get(name)} (config: {value})")
     return list(dict.fromkeys(texts))  # without repetitions: groups often differ alike

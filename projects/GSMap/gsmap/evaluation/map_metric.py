@@ -35,7 +35,8 @@ class MapMetric(GatheredMetric):
             ``out_file`` is given.
         thresholds: Largest Chamfer distances of a match, in metres.
         out_file: Path at which predictions are written in MapTR's JSON form, or None.
-        **kwargs: ``prefix`` of ``BaseMetric``.
+        **kwargs: ``prefix`` of ``BaseMetric``. Its ``collect_device`` and ``collect_dir`` have no
+            effect (`GatheredMetric`).
 
     Raises:
         ValueError: If a metric is unknown, a threshold is no number > 0, or neither a metric nor

@@ -277,7 +277,7 @@ class MapPrior:
 
         Args:
             elements: Map in the global frame, in metres, with the classes of the prior.
-            width_m: Width of a line in metres, > 0, at least drawn as wide as a cell.
+            width_m: Width of a line in metres, > 0. A narrower line is drawn as wide as a cell.
 
         Raises:
             ValueError: If a label or a vertex is out of range, the map is too large, or ``width_m``

@@ -26,9 +26,10 @@ _LOGGER = logging.getLogger(__name__)
 _MANY_GAPS = 20  # so many frames after a gap, and none without one, are named
 # Placeholders: number of frames, seconds of the latest gap, and of the longest allowed one.
 _NO_MEMORY = (
-    "the model has no memory of earlier frames: %d frames came %.3f s after the frame before, and "
-    "streams go on after more than 0 and up to %g s (temporal.max_gap_s). Give samples their times "
-    "(timestamp_ns, in nanoseconds) and scenes, or set a longer gap."
+    "the model has no memory of earlier frames: none of %d frames continued a stream. The last one "
+    "came %.3f s after the frame before, and streams go on after more than 0 and up to %g s "
+    "(temporal.max_gap_s). Give samples their times (timestamp_ns, in nanoseconds) and scenes, or "
+    "set a longer gap."
 )
 
 
@@ -135,18 +136,19 @@ class _Gaps:
         self._num_gaps = 0
         self._has_continued = False
 
-    def _is_near(self, seconds: float) -> bool:
-        """Whether a frame continues the stream of its scene, whose last frame was before.
+    def _continues(self, seconds: float) -> bool:
+        """Whether a frame continues the stream of its scene. It is called once for each frame.
 
         Args:
             seconds: Time since the last frame of the scene.
         """
-        is_near = 0 < seconds <= self.max_gap_s
-        self._has_continued |= is_near
-        self._num_gaps += not is_near
-        if self._num_gaps == _MANY_GAPS and not self._has_continued and not is_near:
+        if 0 < seconds <= self.max_gap_s:
+            self._has_continued = True
+            return True
+        self._num_gaps += 1
+        if self._num_gaps == _MANY_GAPS and not self._has_continued:
             _LOGGER.warning(_NO_MEMORY, self._num_gaps, seconds, self.max_gap_s)
-        return is_near
+        return False
 
 
 class Slots(_Gaps):
@@ -185,7 +187,7 @@ class Slots(_Gaps):
         """Whether a frame continues the stream of a state."""
         if frame.scene != state.frame.scene:
             return False
-        return self._is_near(frame.seconds_after(state.frame))
+        return self._continues(frame.seconds_after(state.frame))
 
     def keep(self, states: Sequence[StreamState]) -> None:
         """Store the states after the frames of a batch, in the order of the batch."""
@@ -282,7 +284,7 @@ class Scenes(_Gaps):
                 f"frame {frame} {fault}: its stream is at {state.frame} already. Hand a stream its "
                 "frames once each and in order, or start a new stream."
             )
-        return state if self._is_near(seconds) else None
+        return state if self._continues(seconds) else None
 
     def keep(self, states: Sequence[StreamState]) -> None:
         """Store the states after the frames of a batch."""

@@ -88,7 +88,7 @@ class RigCamera:
                 f"camera {self.name!r} has the distortion model {self.model!r}, but no distortion: "
                 "give its four coefficients, which are zeros for an ideal fisheye lens."
             )
-        if self.distortion.size > 0:
+        if self.is_distorted:
             self._check_distortion()
 
     def _check_distortion(self) -> None:
