@@ -9,7 +9,7 @@ with calibration.yaml, or a bag of ROS 1 or 2 (docs/inference.md).
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -345,15 +345,35 @@ def run_settings(args: argparse.Namespace) -> dict[str, str]:
     return settings
 
 
-def picture_settings(args: argparse.Namespace) -> str:
-    """Settings of the pictures; empty without pictures.
+def needed_samples(
+    args: argparse.Namespace,
+    dataset: "VectorizedMapDataset",
+    chosen: Sequence[int],
+    done: Collection[str],
+) -> list[int]:
+    """Samples that an earlier run has not predicted, or of which a picture is missing.
 
-    A predicted sample of an earlier run with these settings has its picture already.
+    Args:
+        args: The options of the command.
+        dataset: The samples.
+        chosen: Indices of the samples to predict.
+        done: Tokens of the samples that an earlier run has predicted.
     """
-    if not args.show_dir:
-        return ""
-    names = ("show_dir", "format", "order", "score_thr", "width", "ground_z", "lidar")
-    return ", ".join(f"{name}={getattr(args, name)}" for name in names)
+    tokens = dataset.annotations.column("token")
+    scenes = dataset.annotations.column("scene")
+    needed = []
+    for index in chosen:
+        is_done = tokens[index] in done
+        if is_done and args.show_dir:
+            metainfo = {
+                "token": tokens[index],
+                "scene": scenes[index],
+                "seconds": dataset.annotations.seconds_into_scene[index],
+            }
+            is_done = (args.show_dir / sample_name(metainfo, f".{args.format}")).is_file()
+        if not is_done:
+            needed.append(index)
+    return needed
 
 
 def open_log(
@@ -402,7 +422,6 @@ def predict(
     Returns:
         The reason for each broken frame, by the token of its sample.
     """
-    tokens = dataset.annotations.column("token")
     broken: dict[str, str] = {}
     # Predicted samples of an earlier run. A copy, because the log adds to its set.
     done = set(results.done) if results else set()
@@ -416,9 +435,11 @@ def predict(
             bar.write(f"going on after {len(done)} of {format_count(len(chosen), 'sample')}")
             # A model that uses earlier frames must process all of them again. Their predictions are
             # not logged a second time.
+            # Neither are those of samples whose pictures are missing.
             if not remembers(inferencer):
-                bar.update(len(done))
-                chosen = [index for index in chosen if tokens[index] not in done]
+                needed = needed_samples(args, dataset, chosen, done)
+                bar.update(len(chosen) - len(needed))
+                chosen = needed
 
         def skip(frame: "BrokenFrame") -> None:
             """Record a broken frame, which the model does not predict."""
@@ -592,7 +613,6 @@ def main(argv: list[str] | None = None) -> str | None:
     log_settings = {**settings, "input": str(args.input.resolve()), "samples": samples_digest}
     log_settings["images"] = str(source.data_root)
     log_settings["frame"] = source.frame
-    log_settings["pictures"] = picture_settings(args)
     input_from_model = transforms_to_input(source, dataset, inferencer.model.mount)
     chosen_tokens = [tokens[index] for index in chosen]
     classes = dataset.metainfo["classes"]

@@ -135,7 +135,8 @@ def test_a_run_that_goes_on_lacks_no_picture(drive, model, tmp_path, monkeypatch
     pictures = tmp_path / "pictures"
     words = [str(drive), "--model", *model, "--out", str(tmp_path / "map.json")]
     draw = ["--show-dir", str(pictures), "--width", "400"]
-    original, calls = MapInferencer.elements, []
+    original, calls, drawn = MapInferencer.elements, [], []
+    draw_sample = infer.draw
 
     def killed_at_the_third(self, sample):
         calls.append(sample)
@@ -144,11 +145,13 @@ def test_a_run_that_goes_on_lacks_no_picture(drive, model, tmp_path, monkeypatch
         return original(self, sample)
 
     monkeypatch.setattr(MapInferencer, "elements", killed_at_the_third)
+    monkeypatch.setattr(infer, "draw", lambda *args: drawn.append(args) or draw_sample(*args))
     with pytest.raises(KeyboardInterrupt):
         infer.main([*words, *draw] if drawn_before else words)
     infer.main([*words, *draw])
     assert len(list(pictures.glob("*.png"))) == 4
-    assert len(calls) == 3 + (2 if drawn_before else 4)
+    assert len(calls) == 5  # three, and the two whose results were not there
+    assert len(drawn) == (5 if drawn_before else 4)
 
 
 def test_memory_sees_the_frames_before_after_a_kill_too(
