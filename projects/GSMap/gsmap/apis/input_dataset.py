@@ -12,6 +12,7 @@ from gsmap.checkpoints.building import building
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.source import Mount, Source, change_frame
+from gsmap.engine.map_agreement import check_map_agreement
 
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
@@ -44,10 +45,6 @@ def open_dataset(
         ValueError: If the samples cannot be used with this config.
     """
     settings: dict[str, Any] = dict(cfg.test_dataloader.dataset)
-    # A checkpoint may have set another map of the model than that of the data set.
-    for name in ("grid", "classes"):
-        if settings.get(name) and cfg.model.get(name):
-            settings[name] = cfg.model[name]
     if not settings.get("frame"):  # the samples stay in their frame
         mount = Mount(source.frame, ground_z_m=source.ground_z_m)
     samples = source.samples
@@ -75,7 +72,9 @@ def open_dataset(
     if source.data_root is not None:
         settings["data_root"] = str(source.data_root.resolve())
     with building(cfg):  # adds the name of the config to errors
-        return DATASETS.build(settings)
+        dataset = DATASETS.build(settings)
+    check_map_agreement(cfg, "test", classes_only=True)
+    return dataset
 
 
 def _annotation_meta(
@@ -90,7 +89,7 @@ def _annotation_meta(
         has_poses: Whether the poses of the vehicle are known.
     """
     options = cfg.test_dataloader.dataset
-    grid = cfg.model.get("grid") or options.grid
+    grid = options.get("grid") or cfg.model.grid
     dim = 2  # 3 if a point has a height
     for sample in samples:
         for instance in sample.instances or ():
@@ -99,7 +98,7 @@ def _annotation_meta(
         dataset="samples",
         frame=mount.frame,
         split="test",
-        classes=tuple(cfg.model.get("classes") or options.get("classes") or CLASSES),
+        classes=tuple(options.get("classes") or CLASSES),
         x_range=tuple(grid["x_range"]),
         y_range=tuple(grid["y_range"]),
         dim=dim,

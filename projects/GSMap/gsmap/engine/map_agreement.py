@@ -9,7 +9,7 @@ from gsmap.checkpoints.settings import plain, wrapped_datasets
 from gsmap.utils.errors import InputError
 
 
-def check_map_agreement(cfg: Config, *parts: str) -> None:
+def check_map_agreement(cfg: Config, *parts: str, classes_only: bool = False) -> None:
     """Check that the data sets of a config have the range and the classes of its model.
 
     Other values would train or score a wrong map without an error. A data set that names no range
@@ -18,6 +18,8 @@ def check_map_agreement(cfg: Config, *parts: str) -> None:
     Args:
         cfg: The config.
         parts: Splits of the data sets, ``"train"``, ``"val"`` or ``"test"``.
+        classes_only: Whether ranges may differ, as in inference, where they do not change the
+            predictions.
 
     Raises:
         ValueError: If a range or the list of classes differs; the message names both settings.
@@ -30,6 +32,8 @@ def check_map_agreement(cfg: Config, *parts: str) -> None:
         ):
             dataset_settings = _map_settings(innermost_dataset)
             for name, wanted in model_settings.items():
+                if classes_only and name != "classes":
+                    continue
                 found = dataset_settings.get(name, wanted)
                 if found == wanted:
                     continue
