@@ -527,6 +527,8 @@ def test_schedules_over_epochs_fit_epochs_of_another_length(schedule, lengths):
     kept = {"param_schedulers": [dict(warm_up)]}
     resuming.fit_schedules(kept, configs, ratio=0.5)  # schedules of another config
     assert kept["param_schedulers"] == [warm_up]
+    resuming.fit_schedules(kept, configs[1], ratio=0.5)  # a single schedule without a list
+    assert kept["param_schedulers"] == [{"last_step": 4, "_global_step": 4}]
 
 
 def test_ranks_that_begin_differently_are_refused(tmp_path, monkeypatch):

@@ -42,6 +42,21 @@ def results(path):
     return {r["sample_token"]: r["vectors"] for r in json.loads(path.read_text())["results"]}
 
 
+def kill_at_the_third(monkeypatch) -> list[str]:
+    """Interrupt a run at its third prediction; return the list of predicted tokens, which grows."""
+    original = MapInferencer.elements
+    tokens = []
+
+    def predict(self, sample):
+        tokens.append(sample.metainfo["token"])
+        if len(tokens) == 3:
+            raise KeyboardInterrupt
+        return original(self, sample)
+
+    monkeypatch.setattr(MapInferencer, "elements", predict)
+    return tokens
+
+
 def test_a_root_without_annotation_files_is_predicted_and_can_be_merged(
     drive, model, minicity_annotations, tmp_path, capsys
 ):
@@ -96,15 +111,8 @@ def test_a_killed_run_goes_on_and_broken_frames_are_named_and_tried_again(
     broken.unlink()
     out = tmp_path / "map.json"
     words = [str(drive), "--model", *model, "--out", str(out)]
-    original, calls = MapInferencer.elements, []
-
-    def killed_at_the_third(self, sample):
-        calls.append(sample.metainfo["token"])
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return original(self, sample)
-
-    monkeypatch.setattr(MapInferencer, "elements", killed_at_the_third)
+    original = MapInferencer.elements
+    calls = kill_at_the_third(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         infer.main(words)
     assert not out.exists()
@@ -135,16 +143,9 @@ def test_a_run_that_goes_on_lacks_no_picture(drive, model, tmp_path, monkeypatch
     pictures = tmp_path / "pictures"
     words = [str(drive), "--model", *model, "--out", str(tmp_path / "map.json")]
     draw = ["--show-dir", str(pictures), "--width", "400"]
-    original, calls, drawn = MapInferencer.elements, [], []
+    calls = kill_at_the_third(monkeypatch)
+    drawn = []
     draw_sample = infer.draw
-
-    def killed_at_the_third(self, sample):
-        calls.append(sample)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return original(self, sample)
-
-    monkeypatch.setattr(MapInferencer, "elements", killed_at_the_third)
     monkeypatch.setattr(infer, "draw", lambda *args: drawn.append(args) or draw_sample(*args))
     with pytest.raises(KeyboardInterrupt):
         infer.main([*words, *draw] if drawn_before else words)
@@ -164,15 +165,7 @@ def test_memory_sees_the_frames_before_after_a_kill_too(
     torch.save({"state_dict": MODELS.build(read_config(config).model).state_dict()}, weights)
     words = [str(drive), "--model", str(config), str(weights), "--out"]
     infer.main([*words, str(tmp_path / "whole.json")])
-    original, calls = MapInferencer.elements, []
-
-    def killed_at_the_third(self, sample):
-        calls.append(sample)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return original(self, sample)
-
-    monkeypatch.setattr(MapInferencer, "elements", killed_at_the_third)
+    calls = kill_at_the_third(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         infer.main([*words, str(tmp_path / "killed.json")])
     infer.main([*words, str(tmp_path / "killed.json")])

@@ -57,7 +57,7 @@ class DrivenLanes(NamedTuple):
 def driven_lanes(
     positions_of_drives: Iterable[FloatArray], borders: list[FloatArray]
 ) -> DrivenLanes:
-    """Find the lanes along the track of a vehicle.
+    """Find the lanes along the tracks of a vehicle in one or more drives.
 
     A lane lies between the nearest border on the left of the vehicle and the nearest one on the
     right. Where these borders are 2 to 5 m apart, the centre line is in the middle between them.
@@ -77,7 +77,8 @@ def driven_lanes(
     tree = border_tree(borders)
     lanes = []
     for positions in positions_of_drives:
-        lanes += [_lane_along(track, tree) for track in _tracks(positions)]
+        for track in _tracks(positions):
+            lanes.append(_lane_along(track, borders=tree))
     if not lanes:
         return DrivenLanes([], driven_m=0.0, outside_m=0.0)
     earlier_points = _earlier_points(lanes)

@@ -189,10 +189,13 @@ def fit_schedules(checkpoint: Mapping[str, Any], configs: Any, ratio: float) -> 
 
     Args:
         checkpoint: Content of the checkpoint.
-        configs: Schedules in the config of the run, in the order of those of the checkpoint.
+        configs: Schedules in the config of the run, in the order of those of the checkpoint; a
+            single one may stand without a list.
         ratio: Length of an epoch in the run, relative to that in the checkpoint.
     """
     states = checkpoint.get("param_schedulers")
+    if isinstance(configs, Mapping):
+        configs = [configs]
     if not isinstance(states, list) or not isinstance(configs, list) or len(states) != len(configs):
         return
     for state, config in zip(states, configs, strict=True):
