@@ -243,7 +243,7 @@ def learn(
         experiment_name=f"learn-{work_dir.name}-{epochs}-{resume_from is None}",
         randomness={"seed": None},  # mmengine writes to its default value on resumption
         default_scope="mmdet3d",
-        cfg={"model": {"type": "Learner", "size": (1, 2)}},
+        cfg={"model": {"type": "Learner", "size": (1, 2)}, "param_scheduler": schedule},
     )
     try:
         runner.train()
@@ -352,6 +352,15 @@ def test_a_resumed_run_says_which_settings_the_checkpoint_replaces(lr, end, said
     log = "".join(path.read_text() for path in tmp_path.glob("*/*.log"))
     assert log.count("goes on with the settings of") == bool(said)
     assert f"goes on with the settings of {start}: {', '.join(said)}. For" in log or not said
+
+
+@pytest.mark.parametrize("length", [3, 6])
+def test_a_schedule_over_iterations_ends_with_the_training(length, tmp_path):
+    """Two epochs have two iterations each."""
+    schedule = {"type": "CosineAnnealingLR", "by_epoch": False, "T_max": 4}
+    learn(tmp_path, 2, schedule=schedule)
+    with pytest.raises(ValueError, match=f"lasts 4 iterations but the cosine schedule {length}"):
+        learn(tmp_path, 2, schedule={**schedule, "T_max": length})
 
 
 def test_weights_alone_cannot_be_resumed_from(tmp_path):

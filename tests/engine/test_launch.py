@@ -153,58 +153,6 @@ def test_own_values_start_with_an_underscore():
         read_config(Config({"zzz": 20}))
 
 
-def test_a_cosine_schedule_of_another_length_is_refused():
-    cfg = {"train_cfg": {"max_epochs": 110}, "param_scheduler": [{"by_epoch": True, "T_max": 24}]}
-    with pytest.raises(ValueError, match="lasts 110 epochs but the cosine schedule 24"):
-        check_config(Config(cfg))
-    cfg["param_scheduler"][0]["T_max"] = 110
-    check_config(Config(cfg))
-
-
-@pytest.mark.parametrize(
-    ("wrap", "name"),
-    [
-        (lambda scheduler: scheduler, "param_scheduler"),
-        (lambda scheduler: [{"by_epoch": False}, scheduler], "param_scheduler.1"),
-        (lambda scheduler: {"a": scheduler}, "param_scheduler.a"),
-        (lambda scheduler: {"a": [], "b": [scheduler]}, "param_scheduler.b.0"),
-    ],
-)
-def test_a_cosine_schedule_may_follow_a_warm_up(wrap, name):
-    cfg = {"train_cfg": {"max_epochs": 24}}
-    cfg["param_scheduler"] = wrap({"begin": 4, "T_max": 20})
-    check_config(Config(cfg))
-    cfg["param_scheduler"] = wrap({"begin": 4, "T_max": 24})
-    with pytest.raises(ValueError, match=rf"schedule 24 and begins after 4: .* and {name}\.T_max"):
-        check_config(Config(cfg))
-
-
-@pytest.mark.parametrize(
-    ("scheduler", "epochs", "reason"),
-    [
-        ({"milestones": [100, 120]}, 121, None),
-        (
-            {"milestones": (100, 120)},
-            120,
-            r"comes after 120: set param_scheduler\.0\.milestones to",
-        ),
-        ({"milestones": [100, 120]}, 110, "lasts 110 epochs but the last milestone .* below 110,"),
-        ({"milestones": [20, 30], "begin": 5}, 36, None),
-        ({"milestones": [20, 30], "begin": 5}, 35, "comes after 35: .* to numbers below 30, or"),
-        ({"milestones": [900], "by_epoch": False}, 10, None),  # iterations
-        ({"milestones": []}, 1, None),
-    ],
-)
-def test_milestones_that_a_training_does_not_reach_are_refused(scheduler, epochs, reason):
-    cfg = Config({"train_cfg": {"max_epochs": epochs}, "param_scheduler": [scheduler]})
-    check_config(cfg, for_training=False)
-    if reason is None:
-        check_config(cfg)
-        return
-    with pytest.raises(ValueError, match=reason):
-        check_config(cfg)
-
-
 @pytest.mark.parametrize(
     ("option", "split"),
     [

@@ -220,7 +220,11 @@ def test_runs_that_accumulate_equally_are_compared(tiny_config, protocol):
         ("type='MultiStepLR', milestones=[107, 108, 109]", 11, {"milestones": [8, 9, 10]}),
         # 100 epochs after the first 10, then 50 after the first 10
         ("type='MultiStepLR', milestones=[80], begin=10", 60, {"milestones": [40]}),
-        ("type='MultiStepLR', milestones=[900], by_epoch=False", 20, {"milestones": [900]}),
+        ("type='MultiStepLR', milestones=[9], by_epoch=False", 20, {"milestones": [9]}),
+        ("type='CosineAnnealingLR', T_max=900, begin=5, by_epoch=False", 20, {"T_max": 15}),
+        ("type='CosineAnnealingLR', T_max=44, end=44", 60, {"T_max": 44, "end": 44}),
+        ("type='CosineAnnealingLR', T_max=66, begin=44, end=110", 60, {"T_max": 16, "end": 60}),
+        ("type='PolyLR', end=110", 60, {"end": 60}),
         ("type='StepLR', step_size=10", 33, {"step_size": 3}),
         ("type='StepLR', step_size=10", 2, {"step_size": 1}),
         ("type='CosineAnnealingLR', T_max=100, begin=10", 60, {"T_max": 50}),
@@ -241,18 +245,28 @@ def test_schedules_over_epochs_take_the_length_of_the_budget(
 
 
 @pytest.mark.parametrize(
-    ("milestones", "epochs"), [([77, 99], 2), ([77, 110], 20), ([77, 400], 20)]
+    ("scheduler", "epochs", "reason"),
+    [
+        (
+            "milestones=[77, 99]",
+            2,
+            r"too few .* 2 milestones: .* param_scheduler\.0\.milestones=\[",
+        ),
+        ("milestones=[77, 110]", 20, r"set param_scheduler\.0\.milestones .* below 20"),
+        ("milestones=[77, 400]", 20, r"set param_scheduler\.0\.milestones .* below 20"),
+        ("milestones=[9, 20], by_epoch=False", 20, "lasts 20 iterations .* comes after 20"),
+    ],
 )
 def test_milestones_after_the_budget_are_refused(
-    milestones, epochs, tiny_config, protocol, tmp_path
+    scheduler, epochs, reason, tiny_config, protocol, tmp_path
 ):
     leaf = tmp_path / "leaf.py"
     leaf.write_text(
         f"_base_ = '{tiny_config}'\ntrain_cfg = dict(max_epochs=110)\n"
-        f"param_scheduler = [dict(type='MultiStepLR', milestones={milestones})]\n"
+        f"param_scheduler = [dict(type='MultiStepLR', {scheduler})]\n"
     )
     longer = replace(protocol, budget=epochs)
-    with pytest.raises(ValueError, match=rf"set param_scheduler\.0\.milestones .* below {epochs}"):
+    with pytest.raises(ValueError, match=reason):
         plan(entries(leaf, "a=CONFIG"), longer)
     # The user's override takes precedence.
     option = "param_scheduler.0.milestones=[1]"

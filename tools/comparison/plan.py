@@ -27,7 +27,8 @@ from gsmap.checkpoints.reading import read_weights
 from gsmap.checkpoints.settings import differences, plain, single_dataset_of
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
-from gsmap.engine.launch import check_config, find_milestones, find_schedulers, read_config
+from gsmap.engine.launch import check_config, read_config
+from gsmap.engine.schedules import check_schedules, find_milestones, find_schedulers
 from gsmap.engine.targets import class_of_type
 from gsmap.evaluation.core.evaluator import METRIC_NAMES
 from gsmap.evaluation.map_metric import MapMetric
@@ -337,10 +338,11 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     epochs = _count_epochs(entry, cfg, protocol=protocol, processes=processes)
     comparison_options.append(f"train_cfg.max_epochs={epochs}")
     comparison_options.append(f"train_cfg.val_interval={max(1, epochs // 4)}")
-    comparison_options += _schedule_options(cfg, epochs=epochs)
+    comparison_options += _schedule_options(cfg, epochs=epochs, iterations=protocol.budget)
     options = (*comparison_options, *user_options)
     cfg = read_config(entry.config, parse_options(options))
     check_config(cfg)
+    check_schedules(cfg, iterations=protocol.budget)
     if cfg.train_cfg.max_epochs != epochs:
         raise InputError(f"{entry.name}: the budget decides train_cfg.max_epochs; leave it out.")
     with building(cfg):  # adds the name of the config to errors
@@ -374,47 +376,90 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     )
 
 
-def _schedule_options(cfg: Config, epochs: int) -> list[str]:
-    """Overrides that fit the schedules over epochs of a config to another number of epochs.
+def _schedule_options(cfg: Config, epochs: int, iterations: int) -> list[str]:
+    """Overrides that fit the schedules of a config to another length of the training.
 
-    A cosine schedule ends with the training. Milestones and the step sizes of ``StepLR`` are scaled
-    in proportion. The epochs before the begin of a schedule stay as they are.
+    Args:
+        cfg: Config whose schedules are fitted.
+        epochs: New number of epochs.
+        iterations: New number of iterations.
+
+    Raises:
+        ValueError: If a schedule has more milestones than there are epochs for them.
     """
     options: list[str] = []
+    old_epochs = cfg.train_cfg.get("max_epochs") or epochs
     for name, scheduler in find_schedulers(cfg).items():
-        if not scheduler.get("by_epoch", True):
-            continue
-        begin = scheduler.get("begin", 0)
-        length = epochs - begin
-        if "T_max" in scheduler:
-            options.append(f"{name}.T_max={length}")
-        old_length = (cfg.train_cfg.get("max_epochs") or epochs) - begin
-        if old_length < 1 or length == old_length:
-            continue
-        milestones = _scale_milestones(
-            find_milestones(scheduler), old_length=old_length, length=length
-        )
-        if milestones:
-            options.append(f"{name}.milestones=[{','.join(map(str, milestones))}]")
-        step_size = scheduler.get("step_size")
-        if isinstance(step_size, int | float):
-            scaled_size = max(1, round(step_size * length / old_length))
-            options.append(f"{name}.step_size={scaled_size}")
+        if scheduler.get("by_epoch", True):
+            options += _epoch_options(name, scheduler, old_end=old_epochs, end=epochs)
+        # The config does not tell its number of iterations, so milestones cannot be scaled.
+        elif "T_max" in scheduler and "end" not in scheduler:
+            options.append(f"{name}.T_max={iterations - scheduler.get('begin', 0)}")
     return options
 
 
-def _scale_milestones(milestones: Sequence[float], old_length: int, length: int) -> list[int]:
+def _epoch_options(name: str, scheduler: Mapping[str, Any], old_end: int, end: int) -> list[str]:
+    """Overrides that fit a schedule over epochs to another length of the training.
+
+    A schedule that lasts until the end of the training does so again: milestones and the step sizes
+    of ``StepLR`` are scaled in proportion. The begin of a schedule, and a whole schedule that ends
+    before the training, stay as they are.
+
+    Args:
+        name: Dotted name of the schedule.
+        scheduler: Its settings.
+        old_end: Number of epochs of the config.
+        end: New number of epochs.
+
+    Raises:
+        ValueError: If the schedule has more milestones than there are epochs for them.
+    """
+    options: list[str] = []
+    if "end" in scheduler:
+        if scheduler["end"] < old_end:
+            return []
+        options.append(f"{name}.end={end}")
+    begin = scheduler.get("begin", 0)
+    length = end - begin
+    if "T_max" in scheduler:
+        options.append(f"{name}.T_max={length}")
+    old_length = old_end - begin
+    if old_length < 1 or length == old_length:
+        return options
+    milestones = find_milestones(scheduler)
+    if milestones:
+        scaled = _scale_milestones(name, milestones, old_length=old_length, length=length)
+        options.append(f"{name}.milestones=[{','.join(map(str, scaled))}]")
+    step_size = scheduler.get("step_size")
+    if isinstance(step_size, int | float):
+        options.append(f"{name}.step_size={max(1, round(step_size * length / old_length))}")
+    return options
+
+
+def _scale_milestones(
+    name: str, milestones: Sequence[float], old_length: int, length: int
+) -> list[int]:
     """Scale milestones to another length of their schedule.
 
     Args:
+        name: Dotted name of the schedule, for the error.
         milestones: Epochs of the schedule.
         old_length: Number of epochs of the schedule.
         length: Number of epochs of the result.
 
     Returns:
-        Different epochs in increasing order, from 1. They lie before the end if the milestones do
-        and the schedule has enough epochs; otherwise `check_config` refuses them.
+        Different epochs in increasing order, from 1. They lie before the end if the milestones do;
+        otherwise `check_config` refuses them.
+
+    Raises:
+        ValueError: If there are not enough epochs before the end.
     """
+    if len(milestones) >= length:
+        raise InputError(
+            f"the budget is {length} epochs of {name}, too few for a change at each of its "
+            f"{len(milestones)} milestones: give a larger --budget, or fewer milestones as an "
+            f"override of the config, {name}.milestones=[...]."
+        )
     scaled: list[int] = []
     for index, milestone in enumerate(sorted(milestones)):
         epoch = round(milestone * length / old_length)

@@ -39,6 +39,7 @@ from gsmap.engine.resuming import (
     refusing_state,
 )
 from gsmap.engine.run_log import innermost
+from gsmap.engine.schedules import check_schedules
 from gsmap.utils.errors import InputError, NotFiniteError
 from gsmap.utils.files import read_text, remove_link, write_bytes, write_text
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, calibration_of
@@ -406,9 +407,11 @@ class AtomicCheckpointHook(CheckpointHook):
         """Prepare the training, and run a validation that was due when the run was interrupted.
 
         Raises:
-            ValueError: If the validation data are from another split than the training data, or the
-                ranks begin differently.
+            ValueError: If the validation data are from another split than the training data, the
+                ranks begin differently, or a schedule over iterations does not fit the training.
         """
+        # `check_config` does not know how many iterations the epochs of a data set have.
+        check_schedules(runner.cfg, iterations=runner.max_iters)
         _require_equal_starts(runner)
         super().before_train(runner)  # restores the paths of the best checkpoints when resuming
         self._forget_foreign_best(runner)

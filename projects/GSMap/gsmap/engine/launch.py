@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import DATA_SAMPLERS, LOOPS, OPTIMIZERS, RUNNERS
-from mmengine.config import Config, ConfigDict
+from mmengine.config import Config
 from mmengine.logging import print_log
 from mmengine.registry import Registry, init_default_scope
 from mmengine.utils import import_modules_from_strings
@@ -25,6 +25,7 @@ from gsmap.checkpoints.named_models import find_config
 from gsmap.checkpoints.settings import innermost_datasets, pipeline_steps, scale_steps
 from gsmap.engine.map_agreement import check_map_agreement
 from gsmap.engine.rank_watch import TIMEOUT_S
+from gsmap.engine.schedules import check_schedules
 from gsmap.engine.targets import check_targets, class_of_type, share_settings
 from gsmap.utils.errors import InputError
 from gsmap.utils.faults import registry_names, suggestion
@@ -341,12 +342,11 @@ def check_config(cfg: Config, for_training: bool = True) -> None:
             loop has a wrong type. The runner or backend does not exist. The sampler of a temporal
             model does not keep the order of frames. The range or the classes of the model differ
             from the test data set. For a training also: They differ from the data set of training
-            or validation. The learning-rate schedule ends at another epoch, or has a milestone
-            after the end. The optimizer does not exist. The pipeline lacks a transform that the
-            head needs, or settings of this transform contradict the head. The batch size of a
-            temporal model is not the number of streams. A model with a memory is trained by
-            iterations. Checkpoints count epochs in a training by iterations, or the reverse, or are
-            written elsewhere.
+            or validation. A schedule does not fit the length of the training. The optimizer does
+            not exist. The pipeline lacks a transform that the head needs, or settings of this
+            transform contradict the head. The batch size of a temporal model is not the number of
+            streams. A model with a memory is trained by iterations. Checkpoints count epochs in a
+            training by iterations, or the reverse, or are written elsewhere.
     """
     _check_lengths(cfg)
     _check_backend(cfg)
@@ -360,7 +360,7 @@ def check_config(cfg: Config, for_training: bool = True) -> None:
     check_targets(cfg)  # transforms that compute the targets of the head
     _check_memory_loop(cfg)
     _check_checkpoints(cfg)
-    _check_schedule(cfg)
+    check_schedules(cfg)
     optimizer = (cfg.get("optim_wrapper") or {}).get("optimizer") or {}
     # Without this check, mmengine would build a run without an optimizer.
     _check_registered(
@@ -399,69 +399,6 @@ def _check_backend(cfg: Config) -> None:
             f"{cfg.filename}: env_cfg.dist_cfg.backend must be one of {', '.join(known)}, got "
             f"{backend!r:.60}."
         )
-
-
-def _check_schedule(cfg: Config) -> None:
-    """Require that schedules over epochs fit the length of the training.
-
-    A schedule starts after ``begin`` epochs, and counts its epochs from there. A cosine schedule of
-    ``T_max`` epochs must end with the training, and ``milestones`` must lie before its end.
-    """
-    end = (cfg.get("train_cfg") or {}).get("max_epochs")
-    if end is None:
-        return
-    for name, scheduler in find_schedulers(cfg).items():
-        if not scheduler.get("by_epoch", True):
-            continue
-        begin = scheduler.get("begin", 0)
-        length = scheduler.get("T_max")
-        if length is not None and length != end - begin:
-            start = f" and begins after {begin}" if begin else ""
-            raise InputError(
-                f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {length}"
-                f"{start}: set both train_cfg.max_epochs and {name}.T_max, or inherit from a base "
-                "file that sets both."
-            )
-        last = max(find_milestones(scheduler), default=0)
-        if last and last >= end - begin:
-            raise InputError(
-                f"{cfg.filename}: training lasts {end} epochs but the last milestone of the "
-                f"schedule comes after {begin + last}: set {name}.milestones to numbers below "
-                f"{end - begin}, or a larger train_cfg.max_epochs."
-            )
-
-
-def find_milestones(scheduler: Mapping[str, Any]) -> list[float]:
-    """Return the milestones of a scheduler, empty if it has none.
-
-    Values of a wrong type are left out, because the scheduler reports them when it is built.
-    """
-    milestones = scheduler.get("milestones")
-    if not isinstance(milestones, list | tuple):
-        return []
-    return [milestone for milestone in milestones if isinstance(milestone, int | float)]
-
-
-def find_schedulers(cfg: Config) -> dict[str, ConfigDict]:
-    """Find the schedulers of a config.
-
-    A config has one scheduler, a list of them, or one of both for each of several optimizers.
-
-    Returns:
-        Settings of each scheduler, by dotted name.
-    """
-    settings = cfg.get("param_scheduler") or []
-    groups = {"param_scheduler": settings}
-    if isinstance(settings, dict) and all(isinstance(v, dict | list) for v in settings.values()):
-        groups = {f"param_scheduler.{name}": group for name, group in settings.items()}
-    schedulers: dict[str, ConfigDict] = {}
-    for name, group in groups.items():
-        if isinstance(group, dict):
-            schedulers[name] = group
-            continue
-        for index, scheduler in enumerate(group):
-            schedulers[f"{name}.{index}"] = scheduler
-    return schedulers
 
 
 def _check_registered(cfg: Config, component: str, registry: Registry, type_name: Any) -> None:
