@@ -302,12 +302,9 @@ def main(argv: list[str] | None = None) -> str:
     resamples = read_resamples(args)  # random samples of the scenes; None without an interval
     reports, notes = evaluate_input(args, evaluator)
     ranked = []  # reports of metrics with an AP
-    unranked = []
     for report in reports:
         if report.detections:
             ranked.append(report)
-        else:
-            unranked.append(report)
     analyses = []
     if resamples is not None:
         # The notes of the other file are appended to `notes`, which are printed at the end.
@@ -315,12 +312,11 @@ def main(argv: list[str] | None = None) -> str:
         analyses.append(interval_report((ranked, notes), others, resamples, args))
     if args.by:
         analyses.append(group_report(ranked, groups, args, evaluator))
-    analyses.extend(unranked)
     if args.consistency:
         analyses.append(consistency_report(args, settings))
     if args.uncertainty:
         analyses.append(uncertainty_report(args, settings))
-    print_reports([*ranked, *analyses], notes, args)
+    print_reports([*reports, *analyses], notes, args)
     number = len(reports[0].tokens)
     return f"{format_count(number, 'sample')} in {time.perf_counter() - start:.1f} s"
 

@@ -12,13 +12,16 @@ from gsmap.evaluation.analysis.bootstrap import (
     Resamples,
     ap_differences,
     ap_intervals,
+    format_intervals,
     resampled_aps,
     resampled_figures,
 )
+from gsmap.evaluation.analysis.groups import Groups, ap_by_group
 from gsmap.evaluation.core.average_precision import area_ap, interpolated_ap
 from gsmap.evaluation.core.chamfer_ap import HardChamferConfig
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.metric import MetricSettings
+from gsmap.evaluation.core.report import format_table
 from gsmap.evaluation.core.results_json import write_results
 from gsmap.structures.elements import MapElements
 
@@ -88,8 +91,8 @@ def test_resampled_figures_equal_those_of_files_with_the_scenes_repeated():
         for report in reports_of(repeated(samples, drawn[b])):
             wanted |= report.metrics
         for key, values in found.items():
-            if np.isnan(values[b]):
-                assert wanted[key] == -1
+            if np.isnan(values[b]):  # a report has 0 for AP_chamfer of an absent class
+                assert wanted[key] == (0 if key.startswith("chamfer") else -1)
             else:
                 assert values[b] == pytest.approx(wanted[key], abs=1e-12), (b, key)
     assert (drawn[:, 0] == 0).any(), "no resample is without the last class"
@@ -138,6 +141,68 @@ def test_a_difference_is_paired_scene_by_scene():
         assert (interval.value, interval.low, interval.high) == (0, 0, 0)
     with pytest.raises(ValueError, match="only if their samples and metrics are equal"):
         ap_differences(reports_of(good), reports_of(bad[:-1]), resamples)
+
+
+def rare_crossings(found: int) -> list[tuple[str, str, MapElements, MapElements]]:
+    """Three scenes with a divider each; the first one also has three crossings, some found."""
+    samples = []
+    for number in range(3):
+        truth = [0, 1, 1, 1] if number == 0 else [0]
+        lines = [upright_line(4.0 * place) for place in range(len(truth))]
+        count = 1 + found if number == 0 else 1
+        predictions = MapElements.from_polylines(lines[:count], truth[:count], [0.9] * count)
+        truth = MapElements.from_polylines(lines, truth)
+        samples.append((f"t{number}", f"s{number}", predictions, truth))
+    return samples
+
+
+def test_resamples_without_a_class_do_not_count_in_its_interval():
+    good = reports_of(rare_crossings(found=3))
+    bad = reports_of(rare_crossings(found=1))
+    resamples = Resamples({f"t{i}": f"s{i}" for i in range(3)}, count=100, seed=0)
+    _, drawn = resamples.draw_copies(["t0", "t1", "t2"])
+    assert (drawn[:, 0] == 0).sum() > 10
+    intervals = ap_intervals(good, resamples)
+    differences = ap_differences(good, bad, resamples)
+    for metric in ("chamfer", "chamfer_hard", "raster"):
+        key = f"{metric}/ped_crossing/AP"
+        assert intervals[key].low == intervals[key].high == intervals[key].value == 1
+        difference = differences[key]
+        assert difference.low == pytest.approx(difference.value)
+        assert difference.value > 0.5
+    # No scene has a boundary.
+    assert intervals["chamfer/boundary/AP"].low == -1
+    assert "chamfer/boundary/AP" not in differences
+    rows = format_intervals(intervals, "title").splitlines()
+    assert [row.split()[1:] for row in rows if row.startswith("chamfer/boundary/AP ")] == [["-"]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"chamfer/divider/AP@0.5": None}, "has no 'chamfer/divider/AP@0.5': let it have"),
+        ({"chamfer/mAP": None}, "has no 'chamfer/mAP'"),
+        (
+            {"chamfer/divider/AP": 0.4225},
+            r"divider/AP of .* is 0\.4225, but .* \(area below the curve",
+        ),
+    ],
+)
+def test_an_ap_of_another_rule_has_no_intervals_and_groups(changes, reason):
+    samples = drive(0, 0.6)
+    report = reports_of(samples)[0]
+    metrics = {}
+    for key, value in (report.metrics | changes).items():
+        if value is not None:
+            metrics[key] = value
+    own = replace(report, metrics=metrics)
+    with pytest.raises(ValueError, match=reason):
+        ap_intervals([own], resamples_of(samples))
+    with pytest.raises(ValueError, match=reason):
+        ap_by_group([own], Groups({token: "all" for token, *_ in samples}))
+    if None in changes.values():
+        with pytest.raises(ValueError, match=reason):
+            format_table(own)
 
 
 def test_resamples_are_repeatable_and_need_scenes():

@@ -243,6 +243,25 @@ def test_a_track_twice_in_a_sample_is_named(files, tmp_path):
         drive_frames(tmp_path / "twice.json", annotations, CONFIG.classes)
 
 
+@pytest.mark.parametrize("points", [[], [[3.0, 3.0]]])
+@pytest.mark.parametrize("has_tracks", [False, True])
+def test_predictions_that_are_no_lines_do_not_count(points, has_tracks, files, tmp_path):
+    results, annotations = files
+    figures = evaluate_drives(results, annotations, CONFIG)
+    content = json.loads(results.read_text())
+    for sample in content["results"]:
+        short = {**sample["vectors"][0], "pts": points, "pts_num": len(points)}
+        sample["vectors"].insert(0, short)
+        for number, own in enumerate(sample["vectors"]):
+            if has_tracks:
+                own["track_id"] = number
+    (tmp_path / "short.json").write_text(json.dumps(content))
+    assert evaluate_drives(tmp_path / "short.json", annotations, CONFIG) == figures
+    for frame in drive_frames(tmp_path / "short.json", annotations, CONFIG.classes):
+        assert len(frame.predictions) == 1
+        assert not has_tracks or frame.track_ids.tolist() == [1]
+
+
 def test_the_command_scores_drives_and_writes_tracks(files, tmp_path, capsys):
     results, annotations = files
     tracks, figures = tmp_path / "tracks.json", tmp_path / "figures.json"

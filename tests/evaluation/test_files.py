@@ -408,6 +408,18 @@ def test_ground_truth_outside_of_the_canvas_is_noted(tmp_path, capsys):
         assert "ground truth reaches" not in capsys.readouterr().out
 
 
+def test_a_description_behind_the_ground_truth_is_refused(tmp_path):
+    """Where the keys are sorted, ``GTs`` comes before ``meta``."""
+    results, _, export = write_ego_truth(tmp_path)
+    content = json.loads(export.read_text())
+    export.write_text(json.dumps(content, sort_keys=True))
+    with pytest.raises(ValueError, match=r"\(classes, x_range, y_range\) stands behind .* before"):
+        command()([str(results), str(export)])
+    content["meta"] = {"author": "us"}
+    export.write_text(json.dumps(content, sort_keys=True))
+    command()([str(results), str(export)])
+
+
 @pytest.mark.parametrize(
     ("entry", "message"),
     [

@@ -98,6 +98,31 @@ def test_its_figures_of_shards_are_those_of_the_whole(own_module, scored, tmp_pa
     assert figures_in(whole) == pytest.approx(WANTED)
 
 
+def test_shards_of_metrics_of_all_kinds_are_joined_to_the_same_bytes(scored, tmp_path):
+    names = ["--eval", "pld", "chamfer", "topology", "raster", "chamfer_hard", "vectormapnet"]
+    for part in ("0/2", "1/2"):
+        command()([*scored, *names, "--out", str(tmp_path / "parts.json"), "--shard", part])
+    merge([str(tmp_path / "parts.json")])
+    command()([*scored, *names, "--out", str(tmp_path / "whole.json")])
+    assert (tmp_path / "parts.json").read_bytes() == (tmp_path / "whole.json").read_bytes()
+
+
+def test_a_single_number_of_a_sample_is_joined_from_shards(own_module, scored, tmp_path):
+    """The metres of a sample as one number in place of an array for each class."""
+    text = OWN_METRIC.replace("{'metres': metres}", "{'metres': metres[0].sum()}")
+    text = text.replace(
+        "found, true = np.sum(table.column('metres'), axis=0)",
+        "found = true = np.full(len(self.classes), np.sum(table.column('metres')))",
+    )
+    assert text.count("metres[0].sum()") == text.count("np.full") == 1
+    (tmp_path / "own_metric.py").write_text(text)
+    names = ["--eval", "lengths", "--custom-imports", own_module]
+    for part in ("0/2", "1/2"):
+        command()([*scored, *names, "--out", str(tmp_path / "parts.json"), "--shard", part])
+    merge([str(tmp_path / "parts.json")])
+    assert figures_in(tmp_path / "parts.json") == {f"lengths/{name}": 1.0 for name in CLASSES}
+
+
 def test_a_config_names_it_as_well(own_module):
     with pytest.raises(ValueError, match=r"there is no metric .*'lengths'"):
         MapMetric(eval=["lengths"])
@@ -137,6 +162,19 @@ def test_a_table_of_values_is_in_the_order_of_tokens_and_counts_a_token_once():
     assert table.tokens == ["a", "b"]
     assert [list(x) for x in table.column("x")] == [[1.0], [2.0]]
     assert len(table) == 2
+
+
+def test_only_some_names_of_samples_are_refused():
+    line = MapElements.from_polylines([[[0.0, -20.0], [0.0, 20.0]]], [0], [0.9])
+    evaluator = MapEvaluator.from_names(["chamfer"], MetricSettings(CLASSES))
+    for tokens in ((None, "000000002"), ("a", None)):
+        evaluator.update(line, line, token=tokens[0])
+        with pytest.raises(ValueError, match="a token for every sample, or for none"):
+            evaluator.update(line, line, token=tokens[1])
+        evaluator.reset()
+    evaluator.update(line, line)
+    evaluator.update(line, line)
+    assert evaluator.compute()["chamfer/num_samples"] == 2
 
 
 @pytest.mark.parametrize("name", ["chamfer", "raster", "pld", "topology", "heights", "bemapnet"])

@@ -19,7 +19,8 @@ from torch.utils.data import BatchSampler
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.torchrun import OWN_WORDS
-from gsmap.evaluation.core.results_json import write_results
+from gsmap.evaluation.core.results_json import vectors_of, write_results
+from gsmap.structures.elements import MapElements
 from gsmap.utils.faults import user_message
 from tools.compare import main as compare
 from tools.compare import rate_note
@@ -451,6 +452,25 @@ def test_a_test_of_some_samples_is_scored_again_on_these(minicity_annotations, t
     result.figures["chamfer/num_samples"] = 2.0
     with pytest.raises(ValueError, match=r"results.json has 1 samples of .* and 2 were tested"):
         rescore(result, {})
+
+
+def test_a_test_with_heights_is_scored_again_with_heights(minicity_annotations, tmp_path):
+    path = minicity_annotations["val"]
+    assert evaluator_for(path, {}).metrics[0].dim == 2
+    assert evaluator_for(path, {}, dim=3).metrics[0].dim == 3
+    assert evaluator_for(path, {"dim": 2}, dim=3).metrics[0].dim == 2
+    assert evaluator_for(path, {}, dim=None).metrics[0].dim == AnnotationFile(path).meta.dim
+    token = AnnotationFile(path).column("token")[0]
+    for dim, error in ((2, None), (3, "AP_chamfer of dim 3")):
+        dataset = f"dict(data_root='{path.parent}/', ann_file='{path.name}', indices=1, dim={dim})"
+        folder = with_config(tmp_path / f"{dim}", f"test_dataloader = dict(dataset={dataset})\n")
+        flat = vectors_of(MapElements.from_polylines([[[0.0, 0], [1, 1]]], [0], [0.9]), ["divider"])
+        write_results(folder / "results.json", [(token, flat)])
+        if error is None:
+            rescore(read_result("a", folder, 0), {})
+            continue
+        with pytest.raises(ValueError, match=error):
+            rescore(read_result("a", folder, 0), {})
 
 
 def test_a_run_without_predictions_has_a_table_and_no_curves(tmp_path, monkeypatch, capsys):

@@ -93,6 +93,26 @@ def test_table_gives_last_and_best(run):
     assert rows[2] == ["demo", "8", "8", "1", "0.6", "0.5 / 0.75"]
 
 
+def test_only_a_mean_ap_has_a_best_value(tmp_path):
+    """A smaller error is better. Names of metrics and classes may contain "map"."""
+    names = ("bemapnet/divider/error_m@1.5", "pld/PLD", "raster/heatmap/AP")
+    records = []
+    for step, value in ((1, 0.9), (2, 0.5)):
+        records.append({"step": step, "bemapnet/mAP": value} | dict.fromkeys(names, value))
+    write_log(tmp_path / "a", "20260101_000000", records)
+    log = read_run(tmp_path / "a")
+    assert log.metrics == ["bemapnet/mAP"]
+    assert summary_table([log]).splitlines()[2].split("|")[-2].strip() == "0.5 / 0.9"
+    for record in records:
+        del record["bemapnet/mAP"]
+    write_log(tmp_path / "b", "20260101_000000", records)
+    log = read_run(tmp_path / "b")
+    assert log.metrics == list(names)
+    heads, _, cells = (line.split("|") for line in summary_table([log]).splitlines())
+    assert [head.strip() for head in heads[-4:-1]] == [f"{name} (last)" for name in names]
+    assert [cell.strip() for cell in cells[-4:-1]] == ["0.5"] * 3
+
+
 def test_plot_shows_total_parts_and_metrics(run):
     figure = plot_runs([read_run(run), read_run(run, "again")])
     total, parts, metrics = figure.axes

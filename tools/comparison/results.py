@@ -210,13 +210,17 @@ def check_one_test_set(results: Sequence[Result]) -> None:
             )
 
 
-def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator:
+def evaluator_for(
+    annotations: Path, changes: Mapping[str, Any], dim: int | None = 2
+) -> MapEvaluator:
     """Build AP_chamfer and AP_raster for an annotation file, with its classes and range.
 
     Args:
         annotations: The annotation file.
         changes: Changed rules: values of fields of ``ChamferConfig`` or ``RasterConfig``, or
             ``ground_truth_points``, the number of points to which ground truth is resampled.
+        dim: Number of coordinates in distances, 2 or 3, unless ``changes`` has one; None for that
+            of the file.
 
     Raises:
         ValueError: If there is no such field, or a value is of another type or out of range.
@@ -237,6 +241,7 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
         if type(setting) not in expected:  # True is no number
             raise InputError(f"{key} must be a value such as {examples[key]}, got {value!r:.40}.")
         settings[key] = setting
+    settings.setdefault("dim", dim or meta.dim)
     points = settings.pop("ground_truth_points", None)
     configs = []
     for config in (ChamferConfig, RasterConfig):
@@ -268,7 +273,8 @@ def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
     if "ann_file" not in dataset:
         raise InputError(f"{result.folder}: its config does not name the data of its test.")
     annotations = Path(str(dataset.get("data_root", "")), str(dataset["ann_file"]))
-    evaluator = evaluator_for(annotations, changes)
+    # The data set of the test decides whether its metric counts heights.
+    evaluator = evaluator_for(annotations, changes, dim=dataset.get("dim", 2))
     # The test has compared the split of the model with the split of the annotations.
     pairs = SamplePairs(
         predictions,

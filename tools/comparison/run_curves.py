@@ -67,8 +67,13 @@ class RunLog:
         for key in logged_keys(self.val):
             if key not in _TIMING:
                 names.append(key)
-        mean_names = [name for name in names if "map" in name.lower()]
+        mean_names = [name for name in names if _is_mean_ap(name)]
         return mean_names or names
+
+
+def _is_mean_ap(name: str) -> bool:
+    """Whether a figure is a mAP of any kind. A metric or a class may have "map" in its name."""
+    return "map" in name.rpartition("/")[2].lower()
 
 
 def logged_keys(records: Iterable[Mapping[str, float]]) -> list[str]:
@@ -307,16 +312,17 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
 
 
 def summary_table(runs: Sequence[RunLog]) -> str:
-    """Markdown table of runs: length, loss, speed, last and best value of each metric.
+    """Markdown table of runs: length, loss, speed, and the last value of each metric.
 
-    The best value is the largest one. A value that a run has not logged is ``-``.
+    A mAP has its best value, too. Of other metrics, the smallest may be the best. A value that a
+    run has not logged is ``-``.
     """
     names: list[str] = []
     for run in runs:
         names += [name for name in run.metrics if name not in names]
     header = ["run", "iterations", "loss (first)", "loss (last)", "s / iteration"]
     for name in names:
-        header.append(f"{name} (last / best)")
+        header.append(f"{name} (last / best)" if _is_mean_ap(name) else f"{name} (last)")
     rows = [header]
     for run in runs:
         steps, loss = run.series("loss")
@@ -330,8 +336,10 @@ def summary_table(runs: Sequence[RunLog]) -> str:
         row.append(median)
         for name in names:
             _, values = run.series(name, validation=True)
-            last_and_best = f"{values[-1]:.4g} / {values.max():.4g}" if len(values) else "-"
-            row.append(last_and_best)
+            cell = f"{values[-1]:.4g}" if len(values) else "-"
+            if len(values) and _is_mean_ap(name):
+                cell += f" / {values.max():.4g}"
+            row.append(cell)
         rows.append(row)
     widths = [0] * len(header)
     for row in rows:

@@ -20,6 +20,7 @@ from gsmap.utils.errors import InputError
 _RECALL_POINTS = np.linspace(0.0, 1.0, num=101)
 _SPACING = np.spacing(1.0)  # COCO adds it to the denominator of the precision
 _PERCENTILES = (2.5, 97.5)  # ends of the 95 % interval
+_SAME_AP = 1e-6  # APs that differ by less are equal up to rounding
 
 
 @dataclass(frozen=True)
@@ -237,13 +238,37 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
 
     Returns:
         AP in each resample (B,) by its flat key, such as ``<metric>/<class>/AP@<threshold>``; NaN
-        if it is not defined. Empty for a metric that ranks no predictions.
+        if the resample has no ground truth of the class. Empty for a metric that ranks no
+        predictions.
 
     Raises:
-        ValueError: If ``resamples`` does not know the scene of a sample.
+        ValueError: If ``resamples`` does not know the scene of a sample, or the AP of a metric of
+            a user is computed by another rule than here.
     """
     if not report.detections:
         return {}
+    for key, (value,) in _figures(report, _Whole()).items():
+        own_value = report.figure(key)
+        if abs(value - own_value) > _SAME_AP:
+            rule = "area below the curve" if report.by_distance else "mean at 101 recalls"
+            raise InputError(
+                f"{key} of the metric {report.name!r} is {own_value:.4f}, but its predictions have "
+                f"the AP {value:.4f} ({rule}), so intervals and groups would be of another figure: "
+                "set `by_distance` of its report, or leave `groups` and `detections` empty."
+            )
+    return _figures(report, resamples)
+
+
+class _Whole:
+    """The whole data set as a resample."""
+
+    def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
+        """Return one part with all samples, and one copy of it; see `Weights`."""
+        return np.zeros(len(tokens), dtype=np.int64), np.ones((1, 1))
+
+
+def _figures(report: MetricReport, resamples: Weights) -> dict[str, FloatArray]:
+    """Compute what `resampled_figures` returns, for a metric that ranks predictions."""
     scenes, scene_copies = resamples.draw_copies(report.tokens)
     # AP_chamfer, whose matches are by distance, is an area. AP_raster is a mean at 101 recalls.
     interpolated = not report.by_distance
@@ -267,9 +292,6 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
                 interpolated=interpolated,
             )
         class_aps[name] = aps
-        if report.by_distance and not report.sample_aps:
-            # AP_chamfer of an absent class is 0, but the mean over the classes leaves it out.
-            aps = np.nan_to_num(aps)
         for t, threshold in enumerate(ranked.thresholds):
             figures[f"{name}/AP@{threshold}"] = aps[:, t]
         figures[f"{name}/AP"] = aps.mean(axis=1)
@@ -343,7 +365,7 @@ def ap_intervals(reports: Sequence[MetricReport], resamples: Resamples) -> dict[
     intervals = {}
     for report in reports:
         for key, values in resampled_figures(report, resamples).items():
-            intervals[key] = _interval(report.metrics[key], values)
+            intervals[key] = _interval(report.figure(key), values)
     return intervals
 
 
@@ -360,7 +382,7 @@ def ap_differences(
         resamples: Resamples of the scenes.
 
     Returns:
-        Intervals by flat key, for the AP that is defined in both results.
+        Intervals by flat key, for the AP that is defined in both results and a resample.
 
     Raises:
         ValueError: If metrics or samples of the results differ, or the scene of a sample is
@@ -374,11 +396,12 @@ def ap_differences(
         # Equal samples and an equal seed give equal resamples.
         second_figures = resampled_figures(second_report, resamples)
         for key, values in first_figures.items():
-            first_value = first_report.metrics[key]
-            second_value = second_report.metrics[key]
-            if UNDEFINED not in (first_value, second_value):
-                difference = first_value - second_value
-                intervals[key] = _interval(difference, values=values - second_figures[key])
+            first_value = first_report.figure(key)
+            second_value = second_report.figure(key)
+            differences = values - second_figures[key]
+            if UNDEFINED in (first_value, second_value) or np.isnan(differences).all():
+                continue
+            intervals[key] = _interval(first_value - second_value, values=differences)
     return intervals
 
 
@@ -393,13 +416,17 @@ def format_intervals(intervals: Mapping[str, Interval], title: str, signed: bool
     Args:
         intervals: Intervals by key.
         title: First line of the table.
-        signed: Whether values above 0 have a plus sign, for differences.
+        signed: Whether values above 0 have a plus sign, for differences. Otherwise, a figure whose
+            interval does not exist is ``-``.
     """
     width = max((len(key) for key in intervals), default=0)  # width of the column of keys
     form = "+.4f" if signed else ".4f"
     rows = [title]
     for key, interval in intervals.items():
         value = format(interval.value, form)
+        if interval.low == interval.high == UNDEFINED and not signed:
+            rows.append(f"{key:<{width}}  -")
+            continue
         low = format(interval.low, form)
         high = format(interval.high, form)
         rows.append(f"{key:<{width}}  {value}  {low} to {high}")

@@ -73,8 +73,9 @@ def _read_frames(
         ids = _convert_tracks(values, results=results, token=token)
         if ids is not None:
             _check_tracks(ids, elements=elements, results=results, token=token)
-        predictions[token] = elements
-        track_ids[token] = ids
+        is_line = elements.num_points >= 2  # other metrics leave out fewer points, too
+        predictions[token] = elements.select(is_line)
+        track_ids[token] = None if ids is None else ids[is_line]
         if len(elements):  # an empty sample does not show whether the file has tracks
             last_token[ids is not None] = token
     if len(last_token) > 1:

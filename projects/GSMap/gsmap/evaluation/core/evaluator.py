@@ -100,6 +100,14 @@ class MapEvaluator:
         """Records of the samples so far. The list is created on first use."""
         return []
 
+    @cached_property
+    def _are_named(self) -> set[bool]:
+        """Whether the samples so far have names of the user, with one entry. Created on first use.
+
+        The numbers that stand for missing names could equal names of the user.
+        """
+        return set()
+
     def update(
         self, predictions: MapElements, ground_truth: MapElements, token: str | None = None
     ) -> None:
@@ -111,8 +119,12 @@ class MapEvaluator:
             token: Name of the sample; repeated names count once. Default: the number of the sample.
 
         Raises:
-            ValueError: If the elements do not suit a metric, as in `match`.
+            ValueError: If the elements do not suit a metric, as in `match`, or only some samples
+                have a name.
         """
+        self._are_named.add(token is not None)
+        if len(self._are_named) > 1:
+            raise InputError("give a token for every sample, or for none.")
         if token is None:
             token = f"{len(self._matches):09d}"
         self._matches.append(self.match(token, predictions, ground_truth=ground_truth))
@@ -131,6 +143,7 @@ class MapEvaluator:
     def reset(self) -> None:
         """Remove all samples."""
         self._matches.clear()
+        self._are_named.clear()
 
     @property
     def canvas(self) -> BEVGrid | None:

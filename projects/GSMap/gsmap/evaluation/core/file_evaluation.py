@@ -15,7 +15,13 @@ from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.core.evaluator import MapEvaluator, SampleMatches
 from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
-from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
+from gsmap.evaluation.core.results_json import (
+    GROUND_TRUTH_KEY,
+    RESULTS_KEY,
+    THREE_D,
+    SampleFile,
+    read_leading_meta,
+)
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
@@ -209,6 +215,23 @@ def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bo
     return notes
 
 
+def _require_leading_settings(truth: SampleFile) -> None:
+    """Require that classes and range of ground truth in JSON stand before its samples.
+
+    Args:
+        truth: Ground truth, after its last sample was read.
+
+    Raises:
+        ValueError: If they stand behind the samples, where they were not known during the scoring.
+    """
+    settings = truth.about.keys() & {"classes", "x_range", "y_range"}
+    if settings and not read_leading_meta(truth.path, GROUND_TRUTH_KEY):
+        raise InputError(
+            f"meta of {truth.path} ({', '.join(sorted(settings))}) stands behind the samples, so "
+            f'these were read without it: write "meta" before "{GROUND_TRUTH_KEY}".'
+        )
+
+
 class SamplePairs:
     """Iterable of samples, each with its results and its ground truth; iterate only once.
 
@@ -298,6 +321,8 @@ class SamplePairs:
             # Raises an error if the results are from another split, or their model was trained on
             # another one. `about` is complete only now, after the samples have been read.
             require_results_of(self._truth.split_list, self.about, self._results.path)
+        if isinstance(self._truth, SampleFile):
+            _require_leading_settings(self._truth)
         self._mismatches = mismatch_notes(
             pending_results, pending_truth, allowed=self._allow_mismatch
         )

@@ -105,8 +105,7 @@ def _join_records(metric: str, records: Sequence[Matches]) -> dict[str, npt.NDAr
     for record in records:
         tokens.append(record.token)
         for name, values in arrays_of(record).items():
-            # A single number becomes one row, since arrays are concatenated along their rows.
-            columns.setdefault(name, []).append(np.atleast_1d(values))
+            columns.setdefault(name, []).append(values)
     joined: dict[str, npt.NDArray[Any]] = {f"{metric}{_TOKENS}": np.array(tokens)}
     for name, parts in columns.items():
         joined[f"{metric}/{name}"] = np.concatenate(parts)

@@ -273,15 +273,15 @@ def new_table(matches: Matches) -> MatchTable | ValueTable:
 
 
 def arrays_of(matches: Matches) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of the record of a sample, by name."""
+    """Return the arrays of the record of a sample, by name; a single number has the shape (1,)."""
     arrays = {}
     if isinstance(matches, SampleValues):
         for name, values in matches.values.items():
-            arrays[name] = np.asarray(values)
+            arrays[name] = np.atleast_1d(values)
         return arrays
     for name, values in vars(matches).items():
         if name != "token" and values is not None:  # None: the metric does not have this array
-            arrays[name] = np.asarray(values)
+            arrays[name] = np.atleast_1d(values)
     return arrays
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from gsmap.evaluation.core.average_precision import calibration_error
 from gsmap.evaluation.core.matches import ClassDetections
 from gsmap.structures.elements import FloatArray
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 
 UNDEFINED = -1.0
@@ -40,6 +41,20 @@ class MetricReport:
     tokens: Sequence[str] = ()
     sample_aps: Mapping[str, FloatArray] = field(default_factory=dict)
     by_distance: bool = True
+
+    def figure(self, key: str) -> float:
+        """Return a figure by its flat key.
+
+        Raises:
+            ValueError: If there is no such figure. A metric of a user can lack it.
+        """
+        if key not in self.metrics:
+            raise InputError(
+                f"the metric {self.name!r} ranks predictions, but its report has no {key!r}: let "
+                "it have the figures of `distance_figures` for each class, and the means of the "
+                "APs. A metric without an AP leaves `groups` and `detections` empty."
+            )
+        return self.metrics[key]
 
     @classmethod
     def of_figures(
@@ -140,7 +155,7 @@ def format_table(report: MetricReport) -> str:
     # therefore not left out of the means.
     if some_are_absent and not report.sample_aps:
         lines.append(f"without ground truth, left out of the means: {', '.join(absent)}")
-    mean_ap = report.metrics[f"{report.name}/mAP"]
+    mean_ap = report.figure(f"{report.name}/mAP")
     lines.append(f"mAP_{report.name} = {mean_ap:.6f}")
     return "\n".join(lines)
 
@@ -198,6 +213,6 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
 
 def _cell(report: MetricReport, key: str) -> str:
     """Format one figure; ``-`` if it does not exist."""
-    value = report.metrics[f"{report.name}/{key}"]
+    value = report.figure(f"{report.name}/{key}")
     decimals = 0 if "/num_" in key else 4  # numbers of truths and predictions are counts
     return "-" if value == UNDEFINED else f"{value:.{decimals}f}"
