@@ -8,6 +8,8 @@ with calibration.yaml, or a bag of ROS 1 or 2 (docs/inference.md).
 """
 
 import argparse
+import hashlib
+import json
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
@@ -47,6 +49,7 @@ from mapdata.options import InputOptions
 if TYPE_CHECKING:  # slow to import
     import numpy as np
     from mmdet3d.structures import Det3DDataSample
+    from mmengine.config import Config
 
     from gsmap import MapInferencer
     from gsmap.apis.frame_loader import BrokenFrame
@@ -332,10 +335,23 @@ def result_header(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, A
     return header
 
 
-def run_settings(args: argparse.Namespace) -> dict[str, str]:
-    """Settings of the command that determine the predictions of a sample, by name."""
+def run_settings(args: argparse.Namespace, cfg: "Config") -> dict[str, str]:
+    """Settings of the command that determine the predictions of a sample, by name.
+
+    Args:
+        args: The options of the command.
+        cfg: Config of the model. It is included with its base files, because any of them can be
+            changed between two runs.
+    """
+    from gsmap.checkpoints.settings import plain  # slow to import
+
     checkpoint = chosen_checkpoint(args)
-    settings = {"model": args.model[0], "checkpoint": digest(checkpoint)}
+    used = plain([cfg.model, cfg.test_dataloader.dataset.pipeline])
+    settings = {
+        "model": args.model[0],
+        "config": hashlib.sha256(json.dumps(used, sort_keys=True).encode()).hexdigest(),
+        "checkpoint": digest(checkpoint),
+    }
     for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp"):
         settings[name] = str(getattr(args, name))
     if args.update_prior:
@@ -605,7 +621,7 @@ def main(argv: list[str] | None = None) -> str | None:
     tokens = dataset.annotations.column("token")
     # Indices of the samples to predict: the part of this shard, or all without ``--shard``.
     chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))
-    settings = run_settings(args)
+    settings = run_settings(args, inferencer.cfg)
     samples_digest = digest(dataset.annotations.path)
     # The log of an earlier run is used only if the settings and the input are equal. The data root
     # is included because the name of a folder of extracted images depends on their content and on

@@ -18,6 +18,7 @@ from gsmap.datasets.source import change_frame
 from gsmap.engine.launch import read_config
 from gsmap.utils.shards import digest
 from tools import infer
+from tools.merge import main as merge
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +154,31 @@ def test_a_run_that_goes_on_lacks_no_picture(drive, model, tmp_path, monkeypatch
     assert len(list(pictures.glob("*.png"))) == 4
     assert len(calls) == 5  # three, and the two whose results were not there
     assert len(drawn) == (5 if drawn_before else 4)
+
+
+def test_a_run_whose_config_has_changed_begins_anew(drive, model, tmp_path, monkeypatch, capsys):
+    """The settings may come from a base file of the config that the command names."""
+    base = tmp_path / "base.py"
+    base.write_text(f"_base_ = {str(Path(model[0]).resolve())!r}\n")
+    own = tmp_path / "own.py"
+    own.write_text(f"_base_ = {str(base)!r}\n")
+    words = [str(drive), "--model", str(own), *model[1:], "--out", str(tmp_path / "map.json")]
+    calls = kill_at_the_third(monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        infer.main(words)
+    with base.open("a") as file:
+        file.write("model = dict(map_head=dict(coder=dict(max_num=3)))\n")
+    infer.main(words)
+    assert "going on" not in capsys.readouterr().out
+    assert len(calls) == 7  # three, and all four again
+    assert {len(vectors) for vectors in results(tmp_path / "map.json").values()} == {3}
+    # Shards with one config and with the other do not belong together.
+    parts = ["--out", str(tmp_path / "parts.json"), "--shard"]
+    infer.main([*words[:-2], *parts, "0/2"])
+    base.write_text(f"_base_ = {str(Path(model[0]).resolve())!r}\n")
+    infer.main([*words[:-2], *parts, "1/2"])
+    with pytest.raises(ValueError, match="differs in config"):
+        merge([str(tmp_path / "parts.json")])
 
 
 def test_memory_sees_the_frames_before_after_a_kill_too(

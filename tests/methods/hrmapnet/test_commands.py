@@ -170,8 +170,9 @@ def test_a_new_prior_is_of_the_place_without_one(tmp_path):
 
 def test_predictions_of_a_run_without_update_are_not_used_with_it(model):
     words = ["drive", "--model", *model, "--out", "map.json", "--prior", "town.prior"]
-    plain = infer.run_settings(infer.parse_args(words))
-    assert infer.run_settings(infer.parse_args([*words, "--update-prior"])) != plain
+    cfg = read_config(model[0])
+    plain = infer.run_settings(infer.parse_args(words), cfg)
+    assert infer.run_settings(infer.parse_args([*words, "--update-prior"]), cfg) != plain
 
 
 def test_a_gaussian_prior_of_a_drive_is_read(model, minicity_annotations, tmp_path, capsys):
