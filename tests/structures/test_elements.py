@@ -69,6 +69,14 @@ def test_ground_truth_has_full_confidence_and_a_sample_may_be_empty():
     ("values", "message"),
     [
         (([LINE], [0, 1]), "labels must have one entry for each of the 1 polylines, got 2"),
+        (
+            ([LINE] * 3, [0, 1.5, 2]),
+            "element 1 has the label 1.5, but labels must be class indices",
+        ),
+        (([LINE, LINE], [0.9, 0.7], [0, 1]), "label 0.9.*are labels and scores exchanged"),
+        (([LINE], np.float32([np.nan])), "element 0 has the label nan"),
+        (([LINE, LINE], [[1.0, np.inf]]), "element 1 has the label inf"),
+        (([LINE], ["divider"]), "labels must be class indices, got .*divider"),
         (([LINE], [0], [0.5, 0.5]), "scores must have one entry"),
         (([LINE], [0], None, [np.ones((3, 2))]), r"scales must hold \(2, 2\) values in all"),
         (([LINE], [0], None, None, [[0.0]]), r"rotations must hold \(2,\) values"),
@@ -90,6 +98,13 @@ def test_ground_truth_has_full_confidence_and_a_sample_may_be_empty():
 def test_bad_elements_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         MapElements.from_polylines(*values)
+
+
+def test_whole_labels_of_any_type_are_accepted():
+    for labels in ([0.0, 2.0], np.float32([0, 2]), np.uint8([0, 2]), [[0], [2]]):
+        elements = MapElements.from_polylines([LINE, RING], labels)
+        assert elements.labels.dtype == np.int64
+        assert elements.labels.tolist() == [0, 2]
 
 
 def test_a_sample_without_ground_truth_is_refused_by_the_name_of_the_transform():

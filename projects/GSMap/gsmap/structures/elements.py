@@ -95,11 +95,11 @@ class MapElements:
             Elements.
 
         Raises:
-            ValueError: If the lengths disagree, a point is not (x, y) or (x, y, z), a point is not
-                finite, a score is outside [0, 1], a scale is not positive and finite, or a rotation
-                is not finite.
+            ValueError: If the lengths disagree, a label is no whole number, a point is not (x, y)
+                or (x, y, z), a point is not finite, a score is outside [0, 1], a scale is not
+                positive and finite, or a rotation is not finite.
         """
-        labels = np.asarray(labels, np.int64).reshape(-1)
+        labels = _whole_labels(labels)
         scores = None if scores is None else np.asarray(scores, np.float64).reshape(-1)
         values = {"labels": labels, "scores": scores, "scales": scales, "rotations": rotations}
         for name, given in values.items():
@@ -230,6 +230,23 @@ class MapElements:
             scales=None if self.scales is None else self.scales[vertices],
             rotations=None if self.rotations is None else self.rotations[vertices],
         )
+
+
+def _whole_labels(labels: npt.ArrayLike) -> IntArray:
+    """Convert labels to integers, and refuse values that an integer would change. (N,)"""
+    values = np.asarray(labels).reshape(-1)
+    # The kinds are truth values, signed and unsigned integers, and floating-point numbers.
+    if values.dtype.kind not in "biuf":
+        raise InputError(f"labels must be class indices, got {values[0]!r:.80}.")
+    if values.dtype.kind == "f":
+        is_whole = np.isfinite(values) & (values == np.round(values))
+        if not is_whole.all():
+            index = is_whole.argmin()  # index of the first False
+            raise InputError(
+                f"element {index} has the label {values[index]:g}, but labels must be class "
+                "indices, such as 0 or 1: are labels and scores exchanged?"
+            )
+    return values.astype(np.int64)
 
 
 def _require(valid: BoolArray, offsets: IntArray, fault: str) -> None:
