@@ -406,6 +406,39 @@ def test_wrappers_and_data_sets_with_nested_metainfo_are_joined(build, minicity_
         joined.__class__(parts, lazy_init=True)
 
 
+def test_joined_tests_with_equal_tokens_are_refused(build, minicity_annotations, tmp_path):
+    """The metric would score only the first of two samples of one token."""
+    from mmdet3d.registry import DATASETS
+
+    source = AnnotationFile(minicity_annotations["val"])
+    samples = list(source)
+    other_path = tmp_path / "other.arrow"
+    write_annotations(other_path, source.meta, samples)
+    first = {
+        "type": "VectorizedMapDataset",
+        "ann_file": str(minicity_annotations["val"]),
+        "test_mode": True,
+    }
+    other = {**first, "ann_file": str(other_path)}
+    repeated = {"type": "RepeatDataset", "times": 2, "dataset": first}
+    inner = {"type": "ConcatDataset", "datasets": [repeated]}
+    message = rf"{minicity_annotations['val']} and {other_path} both have the sample .*tokens"
+    for parts in ([first, other], [repeated, other], [inner, other]):
+        joined = {"type": "ConcatDataset", "datasets": parts}
+        with pytest.raises(ValueError, match=message):
+            DATASETS.build(joined)
+        late = DATASETS.build({**joined, "lazy_init": True})
+        with pytest.raises(ValueError, match=message):
+            late.full_init()
+    halves = [{**first, "indices": [0]}, {**other, "indices": [1]}]
+    assert len(DATASETS.build({"type": "ConcatDataset", "datasets": halves})) == 2
+    assert len(DATASETS.build(inner)) == 2 * len(samples)
+    samples = [replace(sample, token=f"b_{sample.token}") for sample in samples]
+    write_annotations(other_path, source.meta, samples)
+    joined = {"type": "ConcatDataset", "datasets": [repeated, other]}
+    assert len(DATASETS.build(joined)) == 3 * len(samples)
+
+
 def test_it_tests_without_ground_truth_and_refuses_to_train(
     build, minicity_root, minicity_annotations, tmp_path
 ):

@@ -1,15 +1,17 @@
 """Data sets one after the other."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from mmdet3d.registry import DATASETS
-from mmengine.dataset import BaseDataset
+from mmengine.dataset import BaseDataset, RepeatDataset
 from mmengine.dataset import ConcatDataset as PlainConcatDataset
 
+from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import MOUNT, RIG
+from gsmap.utils.words import format_count
 
 
 @DATASETS.register_module()
@@ -20,13 +22,17 @@ class ConcatDataset(PlainConcatDataset):
     equal, except for the calibration and the mounting of the cameras. Without ``cameras`` in the
     data sets, the cameras must have equal names in equal order.
 
+    Metrics and result files know a sample by its token. So no two data sets with ``test_mode`` may
+    have samples of equal tokens. Training may repeat tokens.
+
     Args:
         datasets: Data sets or wrappers of data sets, or their configs.
         lazy_init: See ``ConcatDataset`` of mmengine.
         ignore_keys: Names of further entries of the metainfo that may differ.
 
     Raises:
-        ValueError: If other entries of the metainfo differ.
+        ValueError: If other entries of the metainfo differ, or if two data sets for tests have
+            samples of equal tokens.
     """
 
     def __init__(
@@ -52,6 +58,43 @@ class ConcatDataset(PlainConcatDataset):
                     )
         if not lazy_init:
             self.full_init()
+
+    def full_init(self) -> None:
+        """Load all data sets, and compare the tokens of the data sets for tests.
+
+        Raises:
+            ValueError: If two data sets for tests have samples of equal tokens.
+        """
+        if not self._fully_initialized:
+            super().full_init()
+            _require_other_tokens(_tested_datasets(self.datasets))
+
+
+def _tested_datasets(datasets: Iterable[Any]) -> Iterator[VectorizedMapDataset]:
+    """Yield the data sets for tests, also of nested wrappers."""
+    for dataset in datasets:
+        if isinstance(dataset, PlainConcatDataset):
+            yield from _tested_datasets(dataset.datasets)
+        elif isinstance(dataset, RepeatDataset):
+            yield from _tested_datasets([dataset.dataset])
+        elif isinstance(dataset, VectorizedMapDataset) and dataset.test_mode:
+            yield dataset
+
+
+def _require_other_tokens(datasets: Iterable[VectorizedMapDataset]) -> None:
+    """Raise a ``ValueError`` if two data sets have samples of equal tokens."""
+    file_of: dict[str, str] = {}  # annotation file by token
+    for dataset in datasets:
+        tokens = dataset.tokens()
+        repeated = [token for token in tokens if token in file_of]
+        if repeated:
+            raise InputError(
+                f"{file_of[repeated[0]]} and {dataset.ann_file} both have the sample "
+                f"{repeated[0]!r} ({format_count(len(repeated), 'sample')} in all), and a test "
+                "counts one sample of each token: give the samples of one file other tokens, such "
+                "as with the name of the vehicle, or test the files one by one."
+            )
+        file_of.update(dict.fromkeys(tokens, str(dataset.ann_file)))
 
 
 def _comparable(metainfo: dict[str, Any]) -> dict[str, Any]:

@@ -289,13 +289,24 @@ class VectorizedMapDataset(BaseDataset):
         row = super().get_data_info(idx)["row"]  # opens the file on first use
         return self.annotations[row]
 
-    def instance_counts(self) -> np.ndarray:
-        """Return the number of map elements of each sample, -1 without ground truth. (samples,)"""
+    def _rows(self) -> list[int]:
+        """Return the row of each sample in the annotation file."""
         self.full_init()
         rows = []
         for index in range(len(self)):
             rows.append(super().get_data_info(index)["row"])
+        return rows
+
+    def instance_counts(self) -> np.ndarray:
+        """Return the number of map elements of each sample, -1 without ground truth. (samples,)"""
+        rows = self._rows()
         return self.annotations.instance_counts()[rows]
+
+    def tokens(self) -> list[str]:
+        """Return the token of each sample."""
+        rows = self._rows()
+        tokens = self.annotations.column("token")
+        return [tokens[row] for row in rows]
 
     def scenes(self) -> list[list[int]]:
         """Return the indices of the samples of each scene in the order of their times.
@@ -303,13 +314,12 @@ class VectorizedMapDataset(BaseDataset):
         Returns:
             One list for each scene, sorted by the names of the scenes.
         """
-        self.full_init()
+        rows = self._rows()
         names = self.annotations.column("scene")
         times_ns = self.annotations.column("timestamp_ns")
         # Time and index of each sample, by the name of the scene.
         samples: dict[str, list[tuple[int, int]]] = {}
-        for index in range(len(self)):
-            row = super().get_data_info(index)["row"]
+        for index, row in enumerate(rows):
             scene = samples.setdefault(names[row], [])
             scene.append((times_ns[row], index))
         scenes = []
