@@ -94,6 +94,30 @@ def test_wrong_times_and_jumps_are_noticed():
     assert "from sample 'drive19' to 'drive0b', in drive 'drive' of 1 drive: is it one" in line
 
 
+@pytest.mark.parametrize(
+    ("origin", "step"),
+    [
+        ([691_000.3, 5_336_000.7, 520], "0.5"),
+        ([131_100, -40, 0], "0.016"),
+        ([-40, -6e6, 6e6], "0.5"),
+    ],
+)
+def test_positions_rounded_to_float32_are_noticed(origin, step):
+    """A float32 translation, also if the poses are float64 afterwards."""
+    away = rigid(np.eye(3), np.array(origin, dtype=np.float64))
+    samples = with_poses(circle(), lambda pose: away @ pose)
+    assert pose_warnings(samples, "ego") == []
+    rounded = with_poses(samples, lambda pose: rigid(pose[:3, :3], np.float32(pose[:3, 3])))
+    line = pose_warnings(rounded, "ego")[0]
+    assert line.startswith(f"positions are rounded to steps of up to {step} m in drive 'drive'")
+    assert line.endswith("Keep them float64")
+    parked = with_poses(rounded, lambda pose: rounded[0].global_from_frame)
+    partly = rounded[:10] + samples[10:]
+    near = with_poses(circle(), lambda pose: rigid(pose[:3, :3], np.float32(pose[:3, 3])))
+    for right in (parked, partly, near):
+        assert not any("rounded" in text for text in pose_warnings(right, "ego"))
+
+
 def test_a_drive_in_reverse_is_not_called_inverted():
     """Odometry that starts at the origin, where inverted poses look like a drive in reverse."""
     samples = []

@@ -372,6 +372,41 @@ def test_a_map_in_global_coordinates_is_moved_into_each_frame(tmp_path: Path):
             from_records(tmp_path / "w.arrow", [record(**changes)], META, tmp_path)
 
 
+def test_global_coordinates_that_were_rounded_to_float32_are_counted(tmp_path: Path, caplog):
+    """At a northing of 5,300 km, steps of float32 are 0.5 m."""
+    records = []
+    for number in range(10):
+        pose = np.eye(4)
+        pose[:3, 3] = 691_000.3 + 5.1 * number, 5_336_000.7 + 1.3 * number, 520.0
+        points = pose[:2, 3] + np.array([[-9.0, 2.03], [8, 2.07]])
+        line = {"label": 0, "points": points.tolist()}
+        records.append(record(token=str(number), global_from_frame=pose, global_instances=[line]))
+
+    def warnings_of(records: list) -> str:
+        caplog.clear()
+        from_records(tmp_path / "a.arrow", records, META, tmp_path)
+        return caplog.text
+
+    def rounded(item: dict, kind: type) -> dict:
+        pose = item["global_from_frame"].copy()
+        pose[:3, 3] = pose[:3, 3].astype(np.float32)  # still an array of float64
+        return {**item, "global_from_frame": kind(pose)}
+
+    assert "float32" not in warnings_of(records)
+    for kind in (np.asarray, np.float32, np.ndarray.tolist):
+        text = warnings_of([rounded(item, kind) for item in records])
+        assert "10 of 10 records have positions in global_from_frame that are rounded" in text
+        assert "global_instances" not in text
+    assert "float32" not in warnings_of([rounded(records[0], np.asarray), *records[1:]])
+    coarse = []
+    for item in records:
+        line = {"label": 0, "points": np.float32(item["global_instances"][0]["points"])}
+        coarse.append({**item, "global_instances": [line]})
+    text = warnings_of(coarse)
+    assert "10 of 10 records have points of global_instances that are rounded" in text
+    assert "positions in" not in text
+
+
 def test_poses_are_known_of_all_records_or_of_none(tmp_path: Path):
     path = tmp_path / "poses.arrow"
     posed = record(token="a", global_from_frame=np.eye(4))

@@ -23,6 +23,7 @@ from gsmap.datasets.annotations.record import (
 from gsmap.datasets.annotations.schema import whole_number
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size, read_image
+from gsmap.datasets.pose_plausibility import FAR_M, float32_step_m
 from gsmap.structures.classes import AREA_CLASSES, LINE_CLASSES
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
@@ -67,6 +68,18 @@ _CUT_RINGS = (
     "%d of %d records have rings of your own classes that leave the range (the first is %r). They "
     "are cut as areas, so that the border of the range becomes a part of them: give a ring that is "
     "a line in two open parts."
+)
+# Placeholders: number of records with such positions, number of records, first token.
+_COARSE_POSES = (
+    "%d of %d records have positions in global_from_frame that are rounded to float32 (the first "
+    "is %r), which at such large coordinates has steps of 1 cm to 1 m or more: keep them in "
+    "float64, or subtract an origin before they are rounded."
+)
+# Placeholders: number of records with such elements, number of records, first token.
+_COARSE_POINTS = (
+    "%d of %d records have points of global_instances that are rounded to float32 (the first is "
+    "%r), which at such large coordinates has steps of 1 cm to 1 m or more: keep them in float64, "
+    "or subtract an origin before they are rounded."
 )
 _COPY_M = 0.01  # largest distance of two copies of a line
 _SAME_PLACE_M = 0.1  # ends of lines within this distance are one place
@@ -191,6 +204,8 @@ def create_samples(
             sample = _create_sample(record, meta=meta, root=root)
             check_samples([sample], meta)  # raises an error for a wrong shape or value
             count += 1
+            for warning in _coarse_coordinates(record):
+                tokens_of.setdefault(warning, []).append(sample.token)
             if sample.instances is not None:
                 whole = join_lines(sample.instances) if join else sample.instances
                 sample.instances = _clip_elements(whole, meta=meta)
@@ -202,8 +217,27 @@ def create_samples(
             height_m = -road_z_m
             _LOGGER.warning(_UNMOUNTED, sample.token, height_m)
         yield sample
+    # A few positions are float32 numbers by chance.
+    if 2 * len(tokens_of.get(_COARSE_POSES, [])) <= count:
+        tokens_of.pop(_COARSE_POSES, None)
     for warning, tokens in tokens_of.items():
         _LOGGER.warning(warning, len(tokens), count, tokens[0])
+
+
+def _coarse_coordinates(record: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the warnings about global coordinates of a record that are rounded to float32."""
+    if record.get(_POSE) is None:
+        return
+    position = np.asarray(record[_POSE], np.float64)[:3, 3]
+    # Elements near the vehicle have coordinates of the size of its position.
+    if np.abs(position).max() < FAR_M:
+        return
+    if float32_step_m(position):
+        yield _COARSE_POSES
+    elements = record.get(_GLOBAL) or []
+    # `all` ends at the first element that is not rounded.
+    if elements and all(float32_step_m(element["points"]) for element in elements):
+        yield _COARSE_POINTS
 
 
 def _doubts(

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.source import ground_from_frame
@@ -21,6 +22,8 @@ _MAX_SIDEWAYS_DEG = 30.0  # median angle between a step and the direction in whi
 _MAX_TILT_DEG = 30.0  # median angle between the vertical axes of the vehicle and the world
 _MAX_SPEED_M_S = 100.0
 _MIN_JUMP_M = 10.0  # shorter jumps are corrections of a localisation
+FAR_M = 2.0**17
+"""Size in metres of coordinates from which on steps of float32 numbers are larger than 1 cm."""
 
 _Fault = tuple[str, str]  # description, and the likely cause
 _BACKWARDS: _Fault = (
@@ -125,6 +128,26 @@ def pose_warnings(samples: Iterable[MapSample], frame: str) -> list[str]:
     return check.warnings()
 
 
+def float32_step_m(coordinates: npt.ArrayLike) -> float:
+    """Return the precision of coordinates that were rounded to float32.
+
+    At a northing of 5,300 km, for example, neighbouring float32 numbers are 0.5 m apart.
+
+    Args:
+        coordinates: Coordinates in metres. (...)
+
+    Returns:
+        Largest distance of neighbouring float32 numbers at the coordinates, in metres. It is 0 if
+        no coordinate is as large as ``FAR_M``, or if one of these is no float32 number.
+    """
+    values = np.asarray(coordinates, dtype=np.float64)
+    far_values = values[np.abs(values) >= FAR_M]
+    rounded = far_values.astype(np.float32)
+    if not len(rounded) or (rounded != far_values).any():
+        return 0.0
+    return float(np.spacing(np.abs(rounded)).max())
+
+
 def _faults_of(name: str, drive: _Drive) -> list[_Fault]:
     """Faults of a drive."""
     order = np.argsort(drive.times_ns, kind="stable")
@@ -134,19 +157,31 @@ def _faults_of(name: str, drive: _Drive) -> list[_Fault]:
     global_from_frame = np.stack(drive.global_from_frame)[order]
     frame_from_ground = np.stack(drive.frame_from_ground)[order]
     poses = global_from_frame @ frame_from_ground
+    precision_faults = list(_precision_faults(global_from_frame[:, :3, 3]))
     faults = list(_tilt_faults(poses)) + list(_identity_faults(global_from_frame))
     # Without names or times of drives, the order of the poses is not known.
     if faults or not name or times_s[-1] == 0:
-        return faults
-    faults = list(_motion_faults(times_s, tokens, poses))
-    if faults == [_BACKWARDS]:  # it may be a drive in reverse, not an inverted pose
-        return faults
+        return precision_faults + faults
+    motion_faults = list(_motion_faults(times_s, tokens, poses))
     inverse = invert_rigid(global_from_frame) @ frame_from_ground
     has_moved = np.ptp(poses[:, :3, 3], axis=0).max() >= _MIN_STEPS * _MIN_STEP_M
-    if faults and has_moved and not list(_motion_faults(times_s, tokens, inverse)):
+    # A vehicle that moves backwards may drive in reverse, with right poses.
+    may_be_inverted = bool(motion_faults) and motion_faults != [_BACKWARDS] and has_moved
+    if may_be_inverted and not list(_motion_faults(times_s, tokens, inverse)):
         text = "a vehicle moves like this only if the poses are inverted,"
-        return [(text, "they must map points of the frame to the world")]
-    return faults
+        motion_faults = [(text, "they must map points of the frame to the world")]
+    return precision_faults + motion_faults
+
+
+def _precision_faults(positions: np.ndarray) -> Iterator[_Fault]:
+    """Yield a fault if positions of a moving vehicle were rounded to float32. (n, 3)"""
+    is_varying = (positions != positions[0]).any(axis=0)  # a constant coordinate may be round
+    step_m = float32_step_m(positions[:, is_varying])
+    if step_m:
+        yield (
+            f"positions are rounded to steps of up to {step_m:.2g} m",
+            "were they float32, which is too coarse for such large coordinates? Keep them float64",
+        )
 
 
 def _tilt_faults(poses: np.ndarray) -> Iterator[_Fault]:
