@@ -94,6 +94,38 @@ def test_wrong_times_and_jumps_are_noticed():
     assert "from sample 'drive19' to 'drive0b', in drive 'drive' of 1 drive: is it one" in line
 
 
+def later(samples, seconds, suffix=""):
+    """Samples that are taken later, with other tokens."""
+    shift_ns = int(seconds * 1e9)
+    return [
+        replace(s, token=s.token + suffix, timestamp_ns=s.timestamp_ns + shift_ns) for s in samples
+    ]
+
+
+def test_long_gaps_in_a_drive_are_noticed():
+    samples = circle()
+    for second in (circle(), with_poses(circle(), lambda pose: rigid(QUARTER, [900, 0, 0]) @ pose)):
+        (line,) = pose_warnings(samples + later(second, 86_400, "b"), "ego")
+        assert line.startswith(
+            "1 gap of more than 10 minutes, up to 24.0 h from sample 'drive19' to "
+            "'drive0b', in drive 'drive' of 1 drive: is it one drive?"
+        )
+    # The drive of 9.5 s starts 5 s before midnight, on a clock of the time of day.
+    start = later(samples, 86_395)
+    day_ns = 86_400 * 10**9
+    wrapped = [replace(s, timestamp_ns=s.timestamp_ns % day_ns) for s in start]
+    line = pose_warnings(wrapped, "ego")[0]
+    assert "up to 24.0 h from sample 'drive19' to 'drive0'" in line
+    # Inverted poses are recognised beside a gap.
+    inverted = with_poses(samples + later(circle(), 4000, "b"), invert_rigid)
+    lines = pose_warnings(inverted, "ego")
+    assert "gap of more than 10 minutes" in lines[0]
+    assert "only if the poses are inverted" in lines[1]
+    # Pauses, such as those at a level crossing, and drives of their own are no faults.
+    assert pose_warnings(samples + later(circle(), 500, "b"), "ego") == []
+    assert pose_warnings(samples + later(circle("other"), 86_400), "ego") == []
+
+
 @pytest.mark.parametrize(
     ("origin", "step"),
     [

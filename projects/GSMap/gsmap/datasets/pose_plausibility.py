@@ -22,6 +22,7 @@ _MAX_SIDEWAYS_DEG = 30.0  # median angle between a step and the direction in whi
 _MAX_TILT_DEG = 30.0  # median angle between the vertical axes of the vehicle and the world
 _MAX_SPEED_M_S = 100.0
 _MIN_JUMP_M = 10.0  # shorter jumps are corrections of a localisation
+_MAX_GAP_S = 600.0  # between samples of a drive; scenes of published data sets are far shorter
 FAR_M = 2.0**17
 """Size in metres of coordinates from which on steps of float32 numbers are larger than 1 cm."""
 
@@ -170,7 +171,27 @@ def _faults_of(name: str, drive: _Drive) -> list[_Fault]:
     if may_be_inverted and not list(_motion_faults(times_s, tokens, inverse)):
         text = "a vehicle moves like this only if the poses are inverted,"
         motion_faults = [(text, "they must map points of the frame to the world")]
-    return precision_faults + motion_faults
+    return [*precision_faults, *_gap_faults(times_s, tokens), *motion_faults]
+
+
+def _gap_faults(times_s: np.ndarray, tokens: list[str]) -> Iterator[_Fault]:
+    """Yield a fault if a drive is interrupted for long.
+
+    Args:
+        times_s: Ascending times in seconds. (n,)
+        tokens: Names of the samples.
+    """
+    gaps_s = np.diff(times_s)
+    num_gaps = int((gaps_s > _MAX_GAP_S).sum())
+    if num_gaps:
+        longest = int(gaps_s.argmax())
+        yield (
+            f"{format_count(num_gaps, 'gap')} of more than {_MAX_GAP_S / 60:.0f} "
+            f"minutes, up to {gaps_s[longest] / 3600:.1f} h from sample {tokens[longest]!r} to "
+            f"{tokens[longest + 1]!r},",
+            "is it one drive? Drives need different scenes, and times must be nanoseconds that do "
+            "not start again at midnight",
+        )
 
 
 def _precision_faults(positions: np.ndarray) -> Iterator[_Fault]:
