@@ -325,6 +325,71 @@ def test_joined_pieces_keep_their_heights(tmp_path: Path):
     assert len(AnnotationFile(tmp_path / "s.arrow")[0].instances) == 1
 
 
+WITH_CENTERLINE = replace(META, classes=(*META.classes, "centerline"))
+
+
+def joined_lines(tmp_path: Path, label: str, lines: list, dim: int = 2) -> list:
+    """Vertices of the elements of a class after joining, in order."""
+    instances = [{"label": label, "points": points} for points in lines]
+    meta = replace(WITH_CENTERLINE, dim=dim)
+    path = tmp_path / "j.arrow"
+    from_records(path, [record(instances=instances)], meta, tmp_path, join=True)
+    found = AnnotationFile(path)[0].instances
+    assert {meta.classes[item.label] for item in found} == {label}
+    return sorted(item.points.round(3).tolist() for item in found)
+
+
+A, B, C, D = [-20, 0], [0, 0], [20, 0], [20, 9]
+RING = [[0, 0], [5, 0], [5, 5], [0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("lines", "centerlines", "dividers"),
+    [
+        ([[A, B], [B, C]], [[A, B, C]], 1),
+        ([[C, B], [B, A]], [[C, B, A]], 1),
+        ([[A, B], [C, B]], [[A, B], [C, B]], 1),  # head-on
+        ([[B, A], [B, C]], [[B, A], [B, C]], 1),  # both start here
+        ([[A, C], [C, A]], [[A, C], [C, A]], 1),  # both directions on one line
+        ([[A, B, C], [C, A], [[0, 0.004], A], [A, C]], [[A, B, C], [B, A], [C, A]], 1),
+        # Both directions, in tiles
+        ([[A, B], [B, A], [B, C], [C, B]], [[A, B, C], [C, B, A]], 1),
+        ([[A, B], [B, C], [B, D]], [[A, B], [B, C], [B, D]], 3),  # a fork
+        ([[A, B], [C, B], [B, D]], [[A, B], [B, D], [C, B]], 3),
+        ([[A, B, C], [C, D], [D, C], [C, [10, 0]]], [[A, B, C, D], [D, C, [10, 0]]], 3),
+        ([RING, RING[::-1], RING], sorted([RING, RING[::-1]]), 1),  # a roundabout
+        ([RING[:3], RING[2:]], [RING], 1),
+    ],
+)
+def test_centre_lines_are_joined_in_their_direction(
+    tmp_path: Path, lines: list, centerlines: list, dividers: int
+):
+    found = joined_lines(tmp_path, "centerline", lines)
+    assert len(found) == len(centerlines)
+    for points, expected in zip(found, centerlines, strict=True):
+        np.testing.assert_allclose(points, expected, atol=0.005)
+    assert len(joined_lines(tmp_path, "divider", lines)) == dividers
+
+
+@pytest.mark.parametrize("label", ["divider", "centerline"])
+def test_lines_of_a_bridge_are_neither_joined_nor_copies(tmp_path: Path, label: str):
+    def high(line: list, z_m: float) -> list:
+        return [[x, y, z_m] for x, y in line]
+
+    for lines, count in (
+        ([high([A, B], 0), high([[0.05, 0], C], 6)], 2),
+        ([high([A, B], 0), high([B, C], 6)], 2),
+        ([high([A, B], 0), high([B, C], 0.4), high([A, B], 6), high([B, C], 6.2)], 2),
+        ([high([A, C], 0), high([A, C], 6)], 2),
+        ([high([A, C], 0), high([A, C], 0.5)], 1),
+        ([high(RING, 0), high(RING, 6)], 2),
+    ):
+        found = joined_lines(tmp_path, label, lines, dim=3)
+        assert len(found) == count
+        heights = {round(points[0][2]) for points in found}
+        assert heights == ({0, 6} if count == 2 else {0})
+
+
 def test_an_exported_file_is_ground_truth_for_the_evaluation(tmp_path: Path):
     line = {"label": "boundary", "points": [[-20, 2], [0, 2], [20, 3]]}
     from_records(tmp_path / "a.arrow", [record(instances=[line])], META, tmp_path)

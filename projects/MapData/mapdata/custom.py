@@ -24,7 +24,7 @@ from gsmap.datasets.annotations.schema import whole_number
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size, read_image
 from gsmap.datasets.pose_plausibility import FAR_M, float32_step_m
-from gsmap.structures.classes import AREA_CLASSES, LINE_CLASSES
+from gsmap.structures.classes import AREA_CLASSES, DIRECTED_CLASSES, LINE_CLASSES
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.errors import InputError
@@ -32,6 +32,7 @@ from gsmap.utils.files import file_name
 from gsmap.utils.shards import WHOLE, Shard, digest
 from mapdata.calibrated import calibrated_records, digest_of_calibration
 from mapdata.folders.rig import RigCamera
+from mapdata.joining import join_lines, without_copies
 from mapdata.local_map import POLYGON, lift_corners, vertices_of
 from mapdata.paths import path_below
 
@@ -81,8 +82,6 @@ _COARSE_POINTS = (
     "%r), which at such large coordinates has steps of 1 cm to 1 m or more: keep them in float64, "
     "or subtract an origin before they are rounded."
 )
-_COPY_M = 0.01  # largest distance of two copies of a line
-_SAME_PLACE_M = 0.1  # ends of lines within this distance are one place
 _GLOBAL = "global_instances"
 _POSE = "global_from_frame"
 _KEYS = [*(field.name for field in fields(MapSample)), _GLOBAL]
@@ -207,7 +206,7 @@ def create_samples(
             for warning in _coarse_coordinates(record):
                 tokens_of.setdefault(warning, []).append(sample.token)
             if sample.instances is not None:
-                whole = join_lines(sample.instances) if join else sample.instances
+                whole = join_lines(sample.instances, meta.classes) if join else sample.instances
                 sample.instances = _clip_elements(whole, meta=meta)
                 for warning in _doubts(whole, clipped=sample.instances, meta=meta):
                     tokens_of.setdefault(warning, []).append(sample.token)
@@ -254,7 +253,7 @@ def _doubts(
         yield _ALL_ELEMENTS_LOST
     if any(_is_open_area(element, meta) for element in clipped):
         yield _OPEN_AREAS
-    if _has_copies(clipped):
+    if _has_copies(clipped, meta):
         yield _COPIES
     if any(_is_cut_ring(element, meta) for element in whole):
         yield _CUT_RINGS
@@ -280,12 +279,16 @@ def _is_open_area(element: MapInstance, meta: AnnotationMeta) -> bool:
     return is_area and not is_closed(element.points)
 
 
-def _has_copies(elements: Sequence[MapInstance]) -> bool:
+def _has_copies(elements: Sequence[MapInstance], meta: AnnotationMeta) -> bool:
     """Whether two elements of a class are the same line or ring."""
     lines_of: dict[int, list[Points]] = {}  # by label
     for element in elements:
         lines_of.setdefault(element.label, []).append(element.points)
-    return any(len(_without_copies(lines)) < len(lines) for lines in lines_of.values())
+    for label, lines in lines_of.items():
+        is_directed = meta.classes[label] in DIRECTED_CLASSES
+        if len(without_copies(lines, is_directed=is_directed)) < len(lines):
+            return True
+    return False
 
 
 def _clip_elements(elements: Sequence[MapInstance], meta: AnnotationMeta) -> list[MapInstance]:
@@ -296,78 +299,6 @@ def _clip_elements(elements: Sequence[MapInstance], meta: AnnotationMeta) -> lis
         for piece in _clip(points, label=element.label, meta=meta):
             pieces.append(MapInstance(label=element.label, points=piece))
     return pieces
-
-
-def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
-    """Join lines of one class whose ends meet, such as lines of a map that is stored in tiles.
-
-    Two ends meet if they are within 0.1 m of each other in the plane. Lines are joined at places
-    where exactly two ends meet, but not at forks, where three or more meet. Lines may be reversed.
-    Rings are not changed. Copies of a line or a ring are left out: some maps store the line
-    between two lanes with each of them.
-
-    Args:
-        instances: Map elements, in metres.
-
-    Returns:
-        The rings, then the joined lines of each class.
-    """
-    joined = []
-    rings_of: dict[int, list[np.ndarray]] = {}  # rings by label
-    lines_of: dict[int, list[np.ndarray]] = {}  # lines by label
-    for instance in instances:
-        points = np.array(instance.points, np.float64)
-        points_of = rings_of if is_closed(points) else lines_of
-        points_of.setdefault(instance.label, []).append(points)
-    for label, rings in rings_of.items():
-        for points in _without_copies(rings):
-            joined.append(MapInstance(label=label, points=points))
-    for label in sorted(lines_of):
-        _snap_ends(lines_of[label])
-        lines = _without_copies(lines_of[label])
-        parts = shapely.get_parts(shapely.line_merge(shapely.MultiLineString(lines)))
-        # `vertices_of` returns the vertices of each joined line.
-        for points in vertices_of(parts, dim=lines[0].shape[1]):
-            joined.append(MapInstance(label=label, points=points))
-    return joined
-
-
-def _without_copies(lines: Sequence[Points]) -> list[Points]:
-    """Lines that are not within 1 cm of an earlier one in the plane all along. (n, dim) each
-
-    The direction of a line does not count, nor does the start of a ring.
-    """
-    shapes = np.array([shapely.LineString(line[:, :2]) for line in lines], dtype=object)
-    bounds = shapely.bounds(shapes)  # (lines, 4)
-    is_kept = np.zeros(len(lines), dtype=np.bool_)
-    for index, shape in enumerate(shapes):
-        # Copies have nearly equal bounding boxes, which are fast to compare.
-        is_near = (np.abs(bounds - bounds[index]) <= _COPY_M).all(axis=1) & is_kept
-        # Points between the vertices count, too: lines may join the same vertices in another order.
-        distances = shapely.hausdorff_distance(shapes[is_near], shape, densify=0.25)
-        is_kept[index] = not (distances <= _COPY_M).any()
-    return [lines[index] for index in np.flatnonzero(is_kept)]
-
-
-def _snap_ends(lines: Sequence[Points]) -> None:
-    """Give equal coordinates to the ends of lines that meet, in place. (n, dim) each"""
-    places: list[np.ndarray] = []
-    for line in lines:
-        for end in (0, -1):  # first and last vertex
-            other_end = line[-1 - end]  # vertex -1 for end 0, and vertex 0 for end -1
-            place = _nearby_place(places, line[end])
-            if place is None:
-                places.append(line[end].copy())
-            elif not (other_end == place).all():  # otherwise a short line would become a point
-                line[end] = place
-
-
-def _nearby_place(places: Sequence[np.ndarray], point: np.ndarray) -> np.ndarray | None:
-    """First place near a point in the plane; None if there is none. (dim,)"""
-    for place in places:
-        if np.linalg.norm(place[:2] - point[:2]) <= _SAME_PLACE_M:
-            return place
-    return None
 
 
 def _require_keys(values: Any, known: Sequence[str], where: str = "") -> None:
