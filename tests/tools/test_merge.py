@@ -108,6 +108,51 @@ def test_own_records_and_other_ones_among_them(tmp_path):
             merge([str(target)])
 
 
+def test_shards_of_records_with_other_values_are_not_joined(tmp_path):
+    """Poses, cameras and map are compared, too, of all records, in every shard."""
+    meta = AnnotationMeta("mine", "ego", "train")
+    target = tmp_path / "a.arrow"
+
+    def records_of(**changes) -> list[dict]:
+        """Four records, made anew, the last one with changes."""
+        records = []
+        line = {"label": 0, "points": np.array([[-20.0, 3], [40, 3]])}
+        for number in range(4):
+            camera = {"name": "front", "path": f"{number}.jpg", "width": 8, "height": 6}
+            camera |= {"intrinsics": np.eye(3).tolist(), "cam_from_frame": np.eye(4)}
+            pose = np.eye(4)
+            pose[0, 3] = 5.0 * number
+            item = {"token": str(number), "cameras": [camera], "global_from_frame": pose}
+            records.append({**item, "global_instances": [line]})
+        records[-1] |= changes
+        return records
+
+    def make(index: int, records: list[dict]) -> None:
+        from_records(target, records, meta, tmp_path, Shard(index, 2))
+
+    make(1, records_of())
+    make(0, records_of())
+    merge([str(target)])
+    shifted = {"label": 0, "points": np.array([[-20.0, 5], [40, 5]])}
+    camera = records_of()[-1]["cameras"][0]
+    intrinsics = [[1.0, 0, 0.5], [0, 1, 0], [0, 0, 1]]
+    for changes in (
+        {"global_instances": [shifted]},
+        {"global_instances": []},
+        {"global_from_frame": np.diag([-1.0, -1, 1, 1])},
+        {"cameras": [camera | {"intrinsics": intrinsics}]},
+        {"cameras": [camera | {"path": "other.jpg"}]},
+        {"cameras": []},
+        {"timestamp_ns": 1},
+        {"scene": "b"},
+    ):
+        make(0, records_of(**changes))
+        with pytest.raises(ValueError, match="different work, which differs in input"):
+            merge([str(target)])
+    make(0, records_of())
+    merge([str(target)])
+
+
 def test_shards_without_any_sample_are_no_file(tmp_path):
     for index in (0, 1):
         meta = AnnotationMeta("mine", "ego", "train")

@@ -35,6 +35,7 @@ from mapdata.folders.rig import RigCamera
 from mapdata.joining import join_lines, without_copies
 from mapdata.local_map import POLYGON, lift_corners, vertices_of
 from mapdata.paths import path_below
+from mapdata.record_digest import digest_of_records
 
 _LOGGER = logging.getLogger(__name__)
 # Placeholders: token of the record, and height of the sensor above the road in metres.
@@ -148,11 +149,10 @@ def from_records(
     source = ""
     if shard.count:
         # Shards can be joined only if they are parts of one list. `source` identifies the list by
-        # the tokens of all records, by `join`, and by their calibration.
+        # all values of all records, by `join`, and by their calibration.
         records = list(records)
         lines = ["join"] if join else []
-        for record in records:
-            lines.append(str(record.get("token") if isinstance(record, Mapping) else record))
+        lines.append(digest_of_records(records))
         if calibration is not None:
             lines.append(digest_of_calibration(Path(calibration)))
         text = "\n".join(lines)
