@@ -1,5 +1,6 @@
 """Which of a model's cameras looks as one of another rig does."""
 
+import copy
 from types import SimpleNamespace
 from typing import Any
 
@@ -164,6 +165,75 @@ def test_rows_of_classes_of_other_heads_are_found_by_name(head, keys):
     assert all(torch.equal(value, before[key]) for key, value in state.items())
     kept = "classes keep their weights: boundary, divider; begin as new: kerb; are left out: ped_cr"
     assert line.startswith(kept if keys else "classes were divider")
+
+
+def fit_classes(model: torch.nn.Module, names: list[str], trained: torch.nn.Module) -> str:
+    """Load a trained model into one of other classes, and return the line about them."""
+    state = dict(trained.state_dict())
+    drive = SimpleNamespace(metainfo=METAINFO | {"classes": names}, cameras=NUSCENES)
+    origin = METAINFO | {"classes": ORIGIN["classes"], "cameras": NUSCENES}
+    (line,) = fit_start(state, model, drive, origin)
+    model.load_state_dict(state)  # it is strict
+    return line
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["boundary", "divider", "ped_crossing"],
+        ["stop_line", "divider", "ped_crossing", "boundary"],
+        ["kerb", "divider"],
+    ],
+    ids=["other order", "one more", "fewer"],
+)
+def test_masks_of_classes_keep_their_weights_by_name(names):
+    def with_masks(classes: list[str], seed: int) -> torch.nn.Module:
+        masks = {"num_masks": len(classes)}
+        aux_heads = [
+            {"type": "BEVMaskHead", **masks},
+            {"type": "PVMaskHead", **masks},
+            {"type": "BEVMaskHead", "name": "union"},  # one mask for all classes
+        ]
+        head = {**small_config()["map_head"], "aux_heads": aux_heads}
+        return build_small(seed, classes=classes, map_head=head).eval()
+
+    trained, model = with_masks(ORIGIN["classes"], 0), with_masks(names, 1)
+    new = {name: copy.deepcopy(head) for name, head in model.map_head.aux_heads.items()}
+    fit_classes(model, names, trained)
+    feats = torch.randn(2, 16, 3, 4)
+    for name, head in model.map_head.aux_heads.items():
+        trained_head = trained.map_head.aux_heads[name]
+        if name == "union":
+            torch.testing.assert_close(head(feats), trained_head(feats))
+            continue
+        for index, of_class in enumerate(names):
+            if of_class in ORIGIN["classes"]:
+                expected = trained_head(feats)[:, ORIGIN["classes"].index(of_class)]
+                torch.testing.assert_close(head(feats)[:, index], expected)
+            else:
+                assert torch.equal(head[-1].weight[index], new[name][-1].weight[index])
+
+
+def test_masks_that_are_not_as_many_as_the_classes_stay_as_they_are():
+    """A head of three masks has no mask for each of four classes: its weights are loaded."""
+    names = ["stop_line", "divider", "ped_crossing", "boundary"]
+    head = {**small_config()["map_head"], "aux_heads": [{"type": "BEVMaskHead", "num_masks": 3}]}
+    trained = build_small(0, map_head=head)
+    model = build_small(1, classes=names, map_head=head)
+    fit_classes(model, names, trained)
+    weights = [built.map_head.aux_heads["seg"][-1].weight for built in (model, trained)]
+    assert torch.equal(*weights)
+
+
+def test_a_layer_at_several_places_is_reordered_at_each():
+    """StreamMapNet's decoder layers share a branch, as here."""
+    names = ["boundary", "divider", "ped_crossing"]
+    trained, model = build_small(0), build_small(1, classes=names)
+    for built in (trained, model):
+        built.map_head.cls_branches[1] = built.map_head.cls_branches[0]
+    fit_classes(model, names, trained)
+    rows = trained.map_head.cls_branches[0][-1].weight[[2, 0, 1]]
+    torch.testing.assert_close(model.map_head.cls_branches[1][-1].weight, rows)
 
 
 def test_classes_of_a_head_of_another_form_are_said_to_stay():

@@ -1,14 +1,17 @@
 """A detector with a raster prior: reading, writing, training, resuming and its errors."""
 
 import copy
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from methods.hrmapnet.prior_cases import PRIOR, prior_model
 from model_cases import build_small, make_images, small_config
 from prior_cases import CLASSES, frames, pose_at
 
+from gsmap.apis.rig_fit import fit_start
 from gsmap.models.hrmapnet import raster_prior
 from gsmap.models.hrmapnet.raster_prior import CELLS, KEYS, VALID
 from gsmap.prior import KeepMaximum, LastSeen, MapPrior, PriorSettings
@@ -53,6 +56,45 @@ def test_each_part_learns_from_the_map_of_the_step_before():
         assert (prior.bev.layer.bev_embedding.weight.grad.abs().sum() > 0) == (step == 1)
         assert prior.bev.conv[0].weight.grad.abs().sum() > 0
     assert all(parameter.grad is not None for parameter in model.prior.parameters())
+
+
+@pytest.mark.parametrize("neutral", [False, True])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["boundary", "divider", "ped_crossing"],
+        ["stop_line", "divider", "ped_crossing", "boundary"],
+        ["divider", "kerb"],
+    ],
+    ids=["other order", "one more", "fewer"],
+)
+def test_a_trained_prior_reads_its_classes_by_name(names, neutral):
+    """A crossing and a divider of the map have the effect that they have in the trained model."""
+    settings = {**PRIOR, "neutral_start": neutral}
+    trained = build_small(0, classes=list(CLASSES), prior=settings).prior.eval()
+    model = build_small(1, classes=names, prior=settings)
+    state = {f"prior.{key}": value for key, value in trained.state_dict().items()}
+    metainfo = {"classes": names, "x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0)}
+    data = SimpleNamespace(metainfo={**metainfo, "frame": "lidar"}, cameras=None)
+    fit_start(state, model, data, {"classes": list(CLASSES)})
+    prior = model.prior.eval()
+    prior.load_state_dict({key.removeprefix("prior."): value for key, value in state.items()})
+    window, expected_window = (
+        torch.zeros(1, len(classes), part.window.height, part.window.width)
+        for part, classes in ((prior, names), (trained, CLASSES))
+    )
+    for name, rows in (("divider", slice(0, 9)), ("ped_crossing", slice(6, 20))):
+        if name in names:
+            window[:, names.index(name), rows, 3:5] = 1.0
+            expected_window[:, CLASSES.index(name), rows, 3:5] = 1.0
+    feats = torch.randn(1, 16, prior.cells.height, prior.cells.width)
+    results = []
+    for part, values in ((prior, window), (trained, expected_window)):
+        cells = F.pixel_unshuffle(values, part.scale)
+        fused = part.bev.conv(torch.cat([feats, cells], dim=1))
+        results.append((fused, part.queries.label_encoder(cells.movedim(1, -1))))
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected)
 
 
 def test_training_keeps_the_largest_value_and_testing_the_last():

@@ -22,6 +22,7 @@ from gsmap.checkpoints.named_models import named_models
 from gsmap.checkpoints.settings import plain
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.engine.run_log import innermost
+from gsmap.models.base.layers import ClassAxis
 from gsmap.structures.frames import FRAME_VIEWS, viewing_azimuth
 from gsmap.utils.errors import InputError
 from gsmap.utils.shipped import shipped_path
@@ -42,12 +43,6 @@ AZIMUTHS_DEG = {
 # Prefix of the class embeddings of a generator of polylines. They are reordered only together with
 # the class weights of a detector.
 _GENERATOR_LABELS = "map_head.generator.label."
-# Number of rows before the row of the first class, by the prefix of weights with a row per class.
-_CLASS_ROWS = {
-    "map_head.cls_branches.": 0, "map_head.cls_branch.": 0, "map_head.detector.cls_branches.": 0,
-    "map_head.detector.cls_branch.": 0, _GENERATOR_LABELS: 0,
-    "map_head.decoder.maps.0.3.": 1,  # row 0 is the background
-}  # fmt: skip
 _MAX_SAMPLES = 100  # number of samples that are searched for one with all cameras
 
 
@@ -145,7 +140,7 @@ def fit_start(
     lines += _fit_cells(state, initial=initial)
     lines += _fit_queries(state, initial=initial, model=model)
     lines += _fit_classes(
-        state, initial=initial, trained=origin.get("classes"), names=metainfo["classes"]
+        state, model=model, trained=origin.get("classes"), names=metainfo["classes"]
     )
     notes = {
         "x_range": "the queries of the map are stretched to it",
@@ -263,16 +258,13 @@ def _fit_queries(
 
 
 def _fit_classes(
-    state: dict[str, Tensor],
-    initial: Mapping[str, Tensor],
-    trained: Sequence[str] | None,
-    names: Sequence[str],
+    state: dict[str, Tensor], model: nn.Module, trained: Sequence[str] | None, names: Sequence[str]
 ) -> list[str]:
-    """Reorder the rows of classes by name. Classes new to the checkpoint keep their initial rows.
+    """Reorder the weights of classes by name. New classes keep their initial weights.
 
     Args:
         state: Weights of the checkpoint; changed in place.
-        initial: Initial weights of the model.
+        model: Model with its initial weights.
         trained: Classes of the checkpoint; None if unknown.
         names: Classes of the model.
 
@@ -281,11 +273,9 @@ def _fit_classes(
     """
     if trained is None or list(trained) == list(names):
         return []
-    first_rows = _find_class_weights(
-        state, initial=initial, old_count=len(trained), new_count=len(names)
-    )
+    axes = _find_class_axes(state, model=model, old_count=len(trained), new_count=len(names))
     # Nothing is reordered if there are no class weights, or only the embeddings of a generator.
-    if all(key.startswith(_GENERATOR_LABELS) for key in first_rows):
+    if all(key.startswith(_GENERATOR_LABELS) for key in axes):
         return [
             f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
             "classes are loaded without a change of their order, where their sizes fit."
@@ -297,14 +287,20 @@ def _fit_classes(
             old_rows[name] = list(trained).index(name)
         else:
             new_classes.append(name)
-    for key, first_row in first_rows.items():
+    initial = model.state_dict()
+    for key, axis in axes.items():
         old_weights = state[key]
         weights = initial[key].detach().clone().to(old_weights)
-        weights[:first_row] = old_weights[:first_row]
-        for row, name in enumerate(names, start=first_row):
+        new_entries = list(range(axis.first))  # entries before the classes keep their place
+        old_entries = list(range(axis.first))
+        for row, name in enumerate(names):
             if name in old_rows:
-                weights[row] = old_weights[first_row + old_rows[name]]
-        state[key] = weights
+                new_entries += _class_entries(axis, row)
+                old_entries += _class_entries(axis, old_rows[name])
+        device = old_weights.device
+        kept = old_weights.index_select(axis.dim, torch.tensor(old_entries, device=device))
+        target = torch.tensor(new_entries, device=device)
+        state[key] = weights.index_copy(axis.dim, target, kept)
     with_weights = summarize_names(list(old_rows))
     without_weights = summarize_names(new_classes)
     dropped_classes = [name for name in trained if name not in names]
@@ -315,30 +311,44 @@ def _fit_classes(
     ]
 
 
-def _find_class_weights(
-    state: Mapping[str, Tensor], initial: Mapping[str, Tensor], old_count: int, new_count: int
-) -> dict[str, int]:
-    """Find the weights with a row for each class.
+def _class_entries(axis: ClassAxis, index: int) -> range:
+    """Return the indices of the entries of a class along an axis."""
+    start = axis.first + index * axis.size
+    return range(start, start + axis.size)
+
+
+def _find_class_axes(
+    state: Mapping[str, Tensor], model: nn.Module, old_count: int, new_count: int
+) -> dict[str, ClassAxis]:
+    """Find the weights with entries for each class (`mark_classes`).
 
     Args:
         state: Weights of the checkpoint.
-        initial: Initial weights of the model.
+        model: The model.
         old_count: Number of classes of the checkpoint.
         new_count: Number of classes of the model.
 
     Returns:
-        Number of rows before the rows of the classes, by key.
+        The axis of the classes, by key. Weights that do not have the numbers of classes are left
+        out.
     """
-    first_rows: dict[str, int] = {}
-    for prefix, first_row in _CLASS_ROWS.items():
-        for key in initial.keys() & state.keys():
-            if not key.startswith(prefix):
+    axes: dict[str, ClassAxis] = {}
+    # A layer that a model contains several times has a key for each of its places.
+    for name, layer in model.named_modules(remove_duplicate=False):
+        axis = getattr(layer, "class_axis", None)
+        if not isinstance(axis, ClassAxis):
+            continue
+        for parameter_name, parameter in layer.named_parameters(recurse=False):
+            key = f"{name}.{parameter_name}"
+            # A bias has one axis, so it has no entries for classes that are inputs.
+            if key not in state or axis.dim >= parameter.dim():
                 continue
-            has_old_rows = len(state[key]) == first_row + old_count
-            has_new_rows = len(initial[key]) == first_row + new_count
-            if has_old_rows and has_new_rows:
-                first_rows[key] = first_row
-    return first_rows
+            old_shape = list(parameter.shape)
+            old_shape[axis.dim] = axis.first + old_count * axis.size
+            new_size = axis.first + new_count * axis.size
+            if list(state[key].shape) == old_shape and parameter.shape[axis.dim] == new_size:
+                axes[key] = axis
+    return axes
 
 
 @HOOKS.register_module()

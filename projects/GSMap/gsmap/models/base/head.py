@@ -17,7 +17,7 @@ from gsmap.models.base.coder import MapCoder, Samples, Tensors
 from gsmap.models.base.decoder import Decoded, MapDecoder, Queries
 from gsmap.models.base.groups import QueryGroup
 from gsmap.models.base.hooks import FlowHook, FlowPart, FlowStart
-from gsmap.models.base.layers import classification_branch, init_matrices
+from gsmap.models.base.layers import classification_branch, init_matrices, mark_classes
 from gsmap.models.base.loss_head import LossHead
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.masks import ElementMasks
@@ -144,7 +144,9 @@ class MapHead(LossHead):
         num_classes = len(self.classes)
         self.cls_branches = nn.ModuleList()
         for _ in range(num_layers):
-            self.cls_branches.append(classification_branch(embed_dims, num_classes))
+            branch = classification_branch(embed_dims, num_classes)
+            mark_classes(branch[-1])
+            self.cls_branches.append(branch)
         self.loss_cls = MODELS.build(loss_cls)
         self.losses = _build_losses(losses)
         self.aux_heads = _build_parts(aux_heads, embed_dims=embed_dims)

@@ -14,6 +14,7 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
+from gsmap.models.base.layers import mark_classes
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape, constant
 from gsmap.utils.errors import InputError
@@ -82,6 +83,8 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
     ) -> None:
         network = self.layers(embed_dims, num_masks)
         super().__init__(*network)  # the layers are children of the head, with the keys 0 to 2
+        if num_masks > 1:  # a mask per class
+            mark_classes(self[-1])
         self.loss_weight = loss_weight
         self.pos_weight = pos_weight
         self.dice_weight = dice_weight

@@ -1,11 +1,11 @@
 """HDMapNet's BEV network: class logits, instance embeddings and directions of each pixel."""
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 from mmdet.models.backbones.resnet import BasicBlock
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import resize_map, resnet_stages
+from gsmap.models.base.layers import mark_classes, resize_map, resnet_stages
 from gsmap.models.hdmapnet.encoder import JoinedMaps, conv_block
 
 
@@ -86,6 +86,8 @@ class LineMapDecoder(nn.Module):
         self.maps = nn.ModuleList()
         for channels in (1 + num_classes, embedding_dims, 1 + num_directions):
             self.maps.append(FineMaps(widths[2], channels))
+        semantic_branch: Any = self.maps[0]
+        mark_classes(semantic_branch[-1], first=1)  # the first output is the background
 
     def init_weights(self) -> None:
         """Initialise the stages. The other layers keep torch's initial weights.

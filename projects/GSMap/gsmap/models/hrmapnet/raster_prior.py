@@ -13,6 +13,7 @@ from mmengine.logging import print_log
 from torch import Tensor
 
 from gsmap.checkpoints.strict import AddsWeights
+from gsmap.models.base.layers import mark_classes
 from gsmap.models.base.parts import DEFAULTS, build_part
 from gsmap.models.encoders.camera_encoder import stack_calibration
 from gsmap.models.hrmapnet.bev_fusion import PriorBEVFusion
@@ -163,6 +164,8 @@ class RasterPrior(PriorModule, AddsWeights):
                 **heights,
                 **shared,
             )
+            # The inputs of the convolution are the BEV features, then the channels of the map.
+            mark_classes(self.bev.conv[0], dim=1, first=embed_dims, size=self.scale**2)
         self.queries: PriorQueries | None = None
         # Positional encoding of BEV cells for the queries, if the layer of ``bev`` has none.
         self.positions: LearnedPositionalEncoding | None = None
@@ -170,6 +173,7 @@ class RasterPrior(PriorModule, AddsWeights):
             self.queries = build_part(
                 queries, type="PriorQueries", zero_init=neutral_start, **shared
             )
+            mark_classes(self.queries.label_encoder, dim=1, size=self.scale**2)
             if self.bev is None or self.bev.layer is None:
                 # mmdet's encoding joins two halves, one for the column and one for the row.
                 self.positions = LearnedPositionalEncoding(

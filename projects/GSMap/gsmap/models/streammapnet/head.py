@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.coder import Detections, MapCoder
 from gsmap.models.base.head import MapHead
+from gsmap.models.base.layers import mark_classes
 from gsmap.models.base.parts import PartConfig
 from gsmap.models.streammapnet.decoder import StreamMapNetDecoder
 from gsmap.models.streammapnet.reference import LineReference
@@ -65,6 +66,7 @@ class StreamMapNetHead(MapHead):
         num_queries = sum(group.num for group in self.query_groups)
         self.instance_embedding = nn.Embedding(num_queries, self.embed_dims)
         branch = nn.Linear(self.embed_dims, len(self.classes))
+        mark_classes(branch)
         # `MapHead` has created a branch per decoder layer. Here all entries are one module, and
         # `LineReference` shares its regression branch in the same way.
         self.cls_branches = nn.ModuleList([branch] * len(self.cls_branches))

@@ -15,7 +15,12 @@ from torch import Tensor, nn
 
 from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
-from gsmap.models.base.layers import classification_branch, feed_forward, init_matrices
+from gsmap.models.base.layers import (
+    classification_branch,
+    feed_forward,
+    init_matrices,
+    mark_classes,
+)
 from gsmap.models.base.matching import solve_assignment
 from gsmap.models.base.parts import PartConfig
 from gsmap.models.base.references import Reference
@@ -190,6 +195,7 @@ class KeyPointHead(DetectionHead):
             KeyPointLayer(embed_dims, **layer_settings) for _ in range(num_layers)
         )
         self.cls_branch = nn.Linear(_CORNERS * embed_dims, len(classes))
+        mark_classes(self.cls_branch)
         # The corner branch has the layers of a classification branch, but two outputs: x and y.
         self.corner_branch = classification_branch(embed_dims, num_classes=2)
         focal_loss = {"type": "mmdet.FocalLoss", "use_sigmoid": True, "loss_weight": cls_weight}

@@ -11,7 +11,7 @@ import torch
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import init_matrices
+from gsmap.models.base.layers import init_matrices, mark_classes
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import BEVEmbedding
 from gsmap.models.vectormapnet.layers import Cache, GatedLayer, append_cache, keep_most_likely
@@ -106,6 +106,7 @@ class PolylineGenerator(BaseModule):
         # The embedding of a coordinate is the sum of three vectors: for its token, for its axis (x
         # or y), and for the number of its point or box corner.
         self.label = nn.Embedding(num_classes, embed_dims)
+        mark_classes(self.label)
         self.vertex = nn.Embedding(canvas.num_tokens, embed_dims)
         self.position = nn.Embedding(num_positions, embed_dims)
         self.axis = nn.Embedding(2, embed_dims)
