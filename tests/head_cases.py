@@ -5,9 +5,11 @@ import copy
 import torch
 from mmdet3d.registry import MODELS
 from mmengine.structures import InstanceData
-from model_cases import straight_elements
+from model_cases import disable_dropout, straight_elements
 
 import gsmap.registered  # noqa: F401
+from gsmap.models.base.decoder import Queries
+from gsmap.models.base.hooks import FlowHook, FlowStart
 from gsmap.models.base.pairs import Predictions
 from gsmap.structures.grid import BEVGrid
 
@@ -99,6 +101,52 @@ def train_a_step(head: torch.nn.Module, gt: InstanceData) -> dict[str, torch.Ten
     assert all(gradient.isfinite().all() for gradient in gradients)
     torch.optim.SGD(head.parameters(), 1e-3).step()
     return losses
+
+
+class AppendedQueries(FlowHook):
+    """Random queries that are appended to those of a head, as noised queries are in training.
+
+    Args:
+        num: Number of instances.
+        leaks: Let the queries of the head attend to them.
+    """
+
+    def __init__(self, num: int = 3, leaks: bool = False) -> None:
+        self.num, self.leaks, self.total = num, leaks, 0
+
+    def start(self, head: torch.nn.Module, start: FlowStart) -> FlowStart:
+        self.total = sum(group.num for group in head.query_groups)
+        further = []
+        for values in start.queries:
+            rows = values.shape[1] // self.total * self.num
+            further.append(torch.rand(len(values), rows, values.shape[2]))
+        joined = [torch.cat(both, 1) for both in zip(start.queries, further, strict=True)]
+        mask = torch.zeros(2 * [self.total + self.num], dtype=torch.bool)
+        if start.mask is not None:
+            mask[: self.total, : self.total] = start.mask
+        mask[: self.total, self.total :] = not self.leaks
+        return FlowStart(Queries(*joined), mask)
+
+    def outputs(self, head: torch.nn.Module, layers: list[Predictions]) -> list[Predictions]:
+        return [layer.of_queries(slice(self.total)) for layer in layers]
+
+
+def assert_masks_hide_appended_queries(head: torch.nn.Module, feats: dict | None = None) -> None:
+    """Check that queries which a hook appends and masks do not change a head's predictions."""
+    feats = feats or bev()
+    for parameter in head.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)  # so that nothing starts neutral
+    disable_dropout(head).train()
+    with torch.no_grad():
+        plain, hidden, leaked = (
+            head(feats, hooks) for hooks in ((), [AppendedQueries()], [AppendedQueries(leaks=True)])
+        )
+    for layers in zip(plain, hidden, leaked, strict=True):
+        expected, found, other = (layer.scores for layer in layers)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+        assert not torch.allclose(other, expected, atol=1e-4)
+        expected, found, _ = (layer.pts for layer in layers)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
 def assert_neighbours_stay_apart_in_bfloat16(reference: torch.nn.Module) -> None:

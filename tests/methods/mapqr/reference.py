@@ -154,12 +154,12 @@ def check_layer(golden: Golden, name: str) -> Iterator[Row]:
     group = torch.arange(N) >= 8
     for tag, number in (("first", 0), ("later", 3), ("later_masked", 3)):
         layer, steps = layers[number], []
-        layer.mask_groups = tag.endswith("masked")
+        mask = group[:, None] != group if tag.endswith("masked") else None
         hooks = [
             norm.register_forward_pre_hook(lambda _, inputs, own=steps: own.append(inputs[0]))
             for norm in layer.norms[:2]
         ]
-        out = layer(parts.query, parts.query, parts.reference, parts.bev, group[:, None] != group)
+        out = layer(parts.query, parts.query, parts.reference, parts.bev, mask)
         for hook in hooks:
             hook.remove()
         ours = {"self_attn": steps[0][..., ::2], "cross": steps[1][..., ::2], "out": out}

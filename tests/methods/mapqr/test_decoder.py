@@ -4,7 +4,17 @@ import math
 
 import pytest
 import torch
-from head_cases import GSMAP, HEAD, LANES, N, P, bev, build_head, train_a_step
+from head_cases import (
+    GSMAP,
+    HEAD,
+    LANES,
+    N,
+    P,
+    assert_masks_hide_appended_queries,
+    bev,
+    build_head,
+    train_a_step,
+)
 from mmengine.registry import init_default_scope
 
 from gsmap.models.mapqr.decoder import sine_code
@@ -60,6 +70,15 @@ def test_groups_see_each_other_unless_they_are_masked():
         alone = head.eval()(bev())[-1].scores
         together = head.train()(bev())[-1].scores[:, :N]
         assert torch.allclose(alone, together, atol=1e-6) == masked
+
+
+@pytest.mark.parametrize("groups", [GROUPS[:1], GROUPS], ids=["one group", "two groups"])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("base", [HEAD, GSMAP], ids=["points", "Gaussians"])
+def test_masked_queries_of_a_hook_do_not_change_predictions(base, masked, groups):
+    """Also where the groups see each other, queries that a hook has masked are not seen."""
+    head = mapqr(base, mask_groups=masked, query_groups=groups)
+    assert_masks_hide_appended_queries(head)
 
 
 def test_the_learned_position_reaches_the_first_reference_alone():

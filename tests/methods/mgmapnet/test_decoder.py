@@ -52,6 +52,7 @@ def run(decoder, mask=None, num=N, dims=2, step=0.3):
     def refine(_, states, reference):
         return refine_reference(reference, step * states[..., :dims])
 
+    mask = decoder.layer_mask(mask, group_mask=mask)
     layers = decoder(content, position, reference, bev, refine, mask)
     names = vars(layers[0])
     return {name: torch.stack([vars(layer)[name] for layer in layers]) for name in names}

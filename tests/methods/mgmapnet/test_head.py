@@ -10,6 +10,7 @@ from head_cases import (
     N,
     P,
     along_y,
+    assert_masks_hide_appended_queries,
     bev,
     build_head,
     elements,
@@ -55,6 +56,15 @@ def test_one_word_makes_mgmapnet_of_any_head():
     own = {"type": "MGMapNetDecoder", "num_layers": 1, "layer": {"cross_attn": attention}}
     own["layer"]["num_heads"] = 4
     assert build_head(MGMAP, decoder=own).decoder.layers[0].cross_attn.p2i is None
+
+
+@pytest.mark.parametrize("further", [[], [FURTHER]], ids=["one group", "two groups"])
+@pytest.mark.parametrize("base", [MGMAP, GSMAP], ids=["points", "Gaussians"])
+def test_masked_queries_of_a_hook_do_not_change_predictions(base, further):
+    """Points attend to the instances of all groups, but not to those that a hook has masked."""
+    decoder = convert_decoder(HEAD["decoder"])
+    head = build_head(base, decoder=decoder, query_groups=[{"num": N}, *further])
+    assert_masks_hide_appended_queries(head, BEV)
 
 
 @MODELS.register_module()

@@ -2,7 +2,17 @@
 
 import pytest
 import torch
-from head_cases import GSMAP, HEAD, LANES, N, P, bev, build_head, elements
+from head_cases import (
+    GSMAP,
+    HEAD,
+    LANES,
+    N,
+    P,
+    assert_masks_hide_appended_queries,
+    bev,
+    build_head,
+    elements,
+)
 from mmdet3d.registry import MODELS
 from model_cases import make_samples
 from torch import Tensor, nn
@@ -147,6 +157,13 @@ def test_only_a_mask_keeps_the_heads_queries_from_seeing_the_noised_ones():
         plain, losses = step(without_noise(head), LANES), step(head, LANES)
         equal = [torch.allclose(losses[name], value, atol=1e-6) for name, value in plain.items()]
         assert all(equal) != leaks
+
+
+@pytest.mark.parametrize("config", [HEAD, {**GSMAP, **SHAPES}], ids=["points", "Gaussians"])
+def test_masked_queries_of_a_hook_do_not_change_predictions(config):
+    for further in ([], [{"name": "one2many", "num": 6}]):
+        head = build_head(config, query_groups=[{"num": N}, *further])
+        assert_masks_hide_appended_queries(head)
 
 
 def test_further_query_groups_are_trained_beside_the_noised_queries():

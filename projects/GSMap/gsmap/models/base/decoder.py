@@ -253,6 +253,19 @@ class MapDecoder(BaseModule):
         """
         return query, reference, bev_feats
 
+    def layer_mask(self, mask: Tensor | None, group_mask: Tensor | None) -> Any:
+        """Convert an attention mask to the type that the layers take. This class returns ``mask``.
+
+        A decoder in which query groups attend to each other removes the mask between them
+        (`without_groups`), but keeps what hooks have blocked.
+
+        Args:
+            mask: True where an instance (row) may not attend to another (column), or None. It
+                includes the queries that hooks have appended. (N, N)
+            group_mask: The mask between query groups, which ``mask`` contains, or None.
+        """
+        return mask
+
     def point_states(self, state: Any) -> Tensor:
         """Extract the states of the points from the states of a layer. (B, N * P, C)"""
         return state
@@ -279,7 +292,7 @@ class MapDecoder(BaseModule):
         reference: Tensor,
         bev_feats: Tensor,
         refine: Refine,
-        attn_mask: Tensor | None = None,
+        attn_mask: Any = None,
         between: Callable[[int, Queries], Queries] | None = None,
     ) -> list[Decoded]:
         """Run all layers, each with the references of the previous one.
@@ -291,8 +304,7 @@ class MapDecoder(BaseModule):
             bev_feats: BEV features. (B, C, H, W)
             refine: Function of the index of a layer, its point states (B, N * P, C) and references
                 (B, N * P, D). It returns the refined references.
-            attn_mask: True where an instance (row) may not attend to another (column), or None.
-                (N, N)
+            attn_mask: Result of `layer_mask`; None masks nothing.
             between: Function of the index of a layer and the queries after it. It returns the
                 queries of the next layer. None leaves the queries unchanged.
 

@@ -327,7 +327,8 @@ class MapHead(LossHead):
         query_pos = position.expand(len(feats), -1, -1)
         query = content.expand(len(feats), -1, -1)
         queries = Queries(query, query_pos, self.reference.start(query_pos))
-        start = FlowStart(queries, self.attention_mask())
+        group_mask = self.attention_mask()
+        start = FlowStart(queries, group_mask)
         for hook in hooks:
             start = hook.start(self, start)
 
@@ -350,7 +351,7 @@ class MapHead(LossHead):
             reference=start.queries.reference,
             bev_feats=feats,
             refine=refine,
-            attn_mask=start.mask,
+            attn_mask=self.decoder.layer_mask(start.mask, group_mask),
             between=between,
         )
         outputs = []

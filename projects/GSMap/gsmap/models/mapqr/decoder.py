@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.models.base.decoder import Decoded, MapDecoder, MapDecoderLayer
+from gsmap.models.base.groups import without_groups
 from gsmap.models.base.layers import mlp
 from gsmap.utils.errors import InputError
 
@@ -113,8 +114,8 @@ class MapQRDecoderLayer(MapDecoderLayer):
     Args:
         embed_dims: Channels C, a multiple of 4.
         num_points: Points P per instance.
-        mask_groups: Whether to block self-attention between query groups. The published figures of
-            MapQR were obtained without this mask.
+        mask_groups: Whether to block self-attention between query groups (`MapQRDecoder.layer_mask`
+            reads it). The published figures of MapQR were obtained without this mask.
         self_attn: Config of the self-attention of instances (`PointSelfAttention`).
         cross_attn: Config of the cross-attention (`ScatterGatherAttention`).
         kwargs: Further arguments of `MapDecoderLayer`.
@@ -156,14 +157,13 @@ class MapQRDecoderLayer(MapDecoderLayer):
             query: Instance queries. (B, N, C)
             inputs: References of the points (B, N * P, D), BEV features (B, C, H, W), and
                 the self-attention mask (N, N) or None, as in `MapDecoderLayer`. The mask may be
-                left out if ``mask_groups`` is False.
+                left out.
 
         Returns:
             The updated queries. (B, N, C)
         """
         reference, bev_feats, *attn_masks = inputs
-        # `MapDecoder` always gives a mask or None.
-        attn_mask = attn_masks[0] if self.mask_groups else None
+        attn_mask = attn_masks[0] if attn_masks else None
         no_position = torch.zeros_like(query)
         attended = self.self_attn(query, no_position, attn_mask)  # with the residual
         query = self.norms[0](attended)
@@ -205,6 +205,17 @@ class MapQRDecoder(MapDecoder):
             num_points: Points P per instance.
         """
         return {"points_per_state": num_points}
+
+    def layer_mask(self, mask: Tensor | None, group_mask: Tensor | None) -> Tensor | None:
+        """Return the self-attention mask, by default without the mask between query groups.
+
+        Args:
+            mask: True where an instance (row) may not attend to another (column), or None. (N, N)
+            group_mask: The mask between query groups, which ``mask`` contains, or None.
+        """
+        # All layers have the settings of the first one.
+        layer: Any = self.layers[0]
+        return mask if layer.mask_groups else without_groups(mask, group_mask)
 
     def read(self, state: Tensor, references: Tensor) -> Decoded:
         """Output of a layer: the points share the state of their instance.

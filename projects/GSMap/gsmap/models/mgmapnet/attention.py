@@ -67,6 +67,7 @@ class PerPointSampling(SamplingAttention):
         reference: Tensor,
         feats: Sequence[Tensor],
         frames: Tensor | None = None,
+        mask: Tensor | None = None,
     ) -> Granularities:
         """Update the queries from BEV features, residuals included.
 
@@ -77,6 +78,8 @@ class PerPointSampling(SamplingAttention):
                 (B, N, P, D)
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
             frames: Rotations of the offsets of each point, or None. (B, N * P, 2, 2)
+            mask: True where the points of an instance (row) may not attend to another instance
+                (column), or None. (N, N)
 
         Returns:
             Updated queries, with the mean locations of their samples.
@@ -86,12 +89,16 @@ class PerPointSampling(SamplingAttention):
         """
         query = state.instances + position
         samples = self.compute_samples(query, reference, feats=feats, frames=frames)
-        state = self.update(state, feats, samples=samples)
+        state = self.update(state, feats, samples=samples, mask=mask)
         mean_locations = samples.locations.mean(dim=(3, 4, 5))  # (B, N, P, 2)
         return state._replace(mean_locations=mean_locations)
 
     def update(
-        self, state: Granularities, feats: Sequence[Tensor], samples: Samples
+        self,
+        state: Granularities,
+        feats: Sequence[Tensor],
+        samples: Samples,
+        mask: Tensor | None = None,
     ) -> Granularities:
         """Update the queries from the sampled features, residuals included.
 
@@ -99,6 +106,8 @@ class PerPointSampling(SamplingAttention):
             state: Queries of the previous layer.
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
             samples: Locations and weights of the samples.
+            mask: True where the points of an instance (row) may not attend to another instance
+                (column), or None. (N, N)
 
         Returns:
             Updated queries. `forward` adds their mean locations.
@@ -197,7 +206,11 @@ class MultiPointAttention(PerPointSampling):
         self.point_proj = nn.Linear(embed_dims, self.points_per_instance * embed_dims)
 
     def update(
-        self, state: Granularities, feats: Sequence[Tensor], samples: Samples
+        self,
+        state: Granularities,
+        feats: Sequence[Tensor],
+        samples: Samples,
+        mask: Tensor | None = None,
     ) -> Granularities:
         """Update the instance queries from the sampled features, and compute their points.
 
@@ -205,6 +218,7 @@ class MultiPointAttention(PerPointSampling):
             state: Queries of the previous layer.
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
             samples: Locations and weights of the samples.
+            mask: Not used, because instances do not attend to each other.
         """
         # (B, N, P, levels, heads, K, ...) -> (B, N, levels, heads, P * K, ...)
         locations = samples.locations.movedim(2, 4).flatten(4, 5)
@@ -268,7 +282,11 @@ class MultiGranularityAttention(PerPointSampling):
         self.instance_mlp = mlp(num_points * embed_dims, embed_dims, embed_dims)
 
     def update(
-        self, state: Granularities, feats: Sequence[Tensor], samples: Samples
+        self,
+        state: Granularities,
+        feats: Sequence[Tensor],
+        samples: Samples,
+        mask: Tensor | None = None,
     ) -> Granularities:
         """Update both kinds of queries from the sampled features and from each other.
 
@@ -276,6 +294,8 @@ class MultiGranularityAttention(PerPointSampling):
             state: Queries of the previous layer.
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
             samples: Locations and weights of the samples.
+            mask: True where the points of an instance (row) may not attend to another instance
+                (column), or None. (N, N)
         """
         instances, points = self.aggregate(feats, samples)
         point_code, instance_code = self.codes(samples)
@@ -283,7 +303,7 @@ class MultiGranularityAttention(PerPointSampling):
         if self.add_instance:
             points = points + instances[:, :, None]
         points = self.attend_to_instances(
-            points, point_code, instances=instances, instance_code=instance_code
+            points, point_code, instances=instances, instance_code=instance_code, mask=mask
         )
         # Differs from the poster of the paper, which sums the points: the released model
         # concatenates them.
@@ -369,15 +389,22 @@ class MultiGranularityAttention(PerPointSampling):
         return updated_points.unflatten(0, points.shape[:2])
 
     def attend_to_instances(
-        self, points: Tensor, code: Tensor | float, instances: Tensor, instance_code: Tensor | float
+        self,
+        points: Tensor,
+        code: Tensor | float,
+        instances: Tensor,
+        instance_code: Tensor | float,
+        mask: Tensor | None = None,
     ) -> Tensor:
-        """Attend from points to all aggregated instance queries of the sample.
+        """Attend from points to the aggregated instance queries of the sample.
 
         Args:
             points: Point queries. (B, N, P, C)
             code: Position codes of the points, or 0. (B, N, P, C)
             instances: Aggregated instance queries. (B, N, C)
             instance_code: Position codes of the instances, or 0. (B, N, C)
+            mask: True where the points of an instance (row) do not attend to another instance
+                (column), or None. (N, N)
 
         Returns:
             Updated point queries. (B, N, P, C)
@@ -386,7 +413,11 @@ class MultiGranularityAttention(PerPointSampling):
             return points
         query = (points + code).flatten(1, 2)  # (B, N * P, C)
         key = instances + instance_code
-        updated_points = self.p2i(points.flatten(1, 2), query=query, key=key, value=instances)
+        if mask is not None:
+            mask = mask.repeat_interleave(points.shape[2], dim=0)  # (N * P, N)
+        updated_points = self.p2i(
+            points.flatten(1, 2), query=query, key=key, value=instances, mask=mask
+        )
         return updated_points.unflatten(1, points.shape[1:3])
 
 
@@ -407,7 +438,14 @@ class Interaction(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(2))
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, content: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    def forward(
+        self,
+        content: Tensor,
+        query: Tensor,
+        key: Tensor,
+        value: Tensor,
+        mask: Tensor | None = None,
+    ) -> Tensor:
         """Update the content by attention.
 
         Args:
@@ -415,10 +453,11 @@ class Interaction(nn.Module):
             query: Queries. (B, Q, C)
             key: Keys. (B, S, C)
             value: Values. (B, S, C)
+            mask: True where a query (row) does not attend to a key (column), or None. (Q, S)
 
         Returns:
             Updated content. (B, Q, C)
         """
-        attention_output, _ = self.attn(query, key, value, need_weights=False)
+        attention_output, _ = self.attn(query, key, value, attn_mask=mask, need_weights=False)
         content = self.norms[0](content + self.dropout(attention_output))
         return self.norms[1](self.ffn(content))

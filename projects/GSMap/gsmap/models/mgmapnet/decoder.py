@@ -2,15 +2,26 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.base.decoder import Decoded, MapDecoder, MapDecoderLayer
+from gsmap.models.base.groups import without_groups
 from gsmap.models.base.layers import feed_forward, mlp
 from gsmap.models.mgmapnet.attention import Granularities
 from gsmap.models.mgmapnet.bev_pyramid import BEVPyramid
+
+
+class InstanceMasks(NamedTuple):
+    """Masks of the two attentions of a layer between instances, (N, N) each.
+
+    True where an instance (row) may not attend to another (column); None masks nothing.
+    """
+
+    self_attn: Tensor | None = None  # between the instance queries
+    p2i: Tensor | None = None  # from the points of an instance to instances
 
 
 @MODELS.register_module()
@@ -75,7 +86,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         query_pos: Tensor,
         reference: Tensor,
         feats: Sequence[Tensor],
-        attn_mask: Tensor | None,
+        masks: InstanceMasks | None,
     ) -> Granularities:
         """Update instance and point queries.
 
@@ -84,13 +95,20 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             query_pos: Learned positions of the instances. (B, N, C)
             reference: References of the points. (B, N * P, D)
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
-            attn_mask: True where an instance does not attend to another one, or None. (N, N)
+            masks: Masks of the attentions, or None.
 
         Returns:
             Updated queries.
         """
+        if masks is None:
+            masks = InstanceMasks()
         state = self.update_instances(
-            state, query_pos, reference=reference, feats=feats, attn_mask=attn_mask
+            state,
+            query_pos,
+            reference=reference,
+            feats=feats,
+            attn_mask=masks.self_attn,
+            p2i_mask=masks.p2i,
         )
         # As in mmcv, the residual is added within the feed-forward network.
         return state._replace(points=self.point_norm(self.point_ffn(state.points)))
@@ -102,6 +120,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         reference: Tensor,
         feats: Sequence[Tensor],
         attn_mask: Tensor | None,
+        p2i_mask: Tensor | None = None,
     ) -> Granularities:
         """Apply all parts of the layer except the feed-forward network of the points.
 
@@ -111,6 +130,8 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             reference: References of the points. (B, N * P, D)
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
             attn_mask: True where an instance does not attend to another one, or None. (N, N)
+            p2i_mask: True where the points of an instance (row) do not attend to another instance
+                (column), or None. (N, N)
 
         Returns:
             Updated queries.
@@ -130,7 +151,14 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             frames = self.guidance.frames(reference, feats[0])
         position = self.guide_position(position, reference)
         # Updates the instance queries and the point queries.
-        state = self.cross_attn(state, position, reference=by_instance, feats=feats, frames=frames)
+        state = self.cross_attn(
+            state,
+            position,
+            reference=by_instance,
+            feats=feats,
+            frames=frames,
+            mask=p2i_mask,
+        )
         instances = self.ffn(self.norms[1](state.instances))
         return state._replace(instances=self.norms[2](instances))
 
@@ -218,6 +246,17 @@ class MGMapNetDecoder(MapDecoder):
         references = reference.repeat_interleave(self.num_points, dim=1)
         # Point queries are None here. The attention of the first layer creates them.
         return Granularities(query), references, self.bev_pyramid(bev_feats)
+
+    def layer_mask(self, mask: Tensor | None, group_mask: Tensor | None) -> InstanceMasks:
+        """Return the masks of the layers. Only the self-attention separates the query groups.
+
+        As in the released model, points also attend to the instances of other groups.
+
+        Args:
+            mask: True where an instance (row) may not attend to another (column), or None. (N, N)
+            group_mask: The mask between query groups, which ``mask`` contains, or None.
+        """
+        return InstanceMasks(self_attn=mask, p2i=without_groups(mask, group_mask))
 
     def point_states(self, state: Granularities) -> Tensor:
         """Return the states of the points of a layer's output. (B, N * P, C)"""
