@@ -26,7 +26,7 @@ import numpy as np
 from drivemaps.change import Pass
 from drivemaps.changes import find_changes, summarize_changes, write_changes
 from drivemaps.config import MergeConfig
-from drivemaps.drive import Drive, read_drive, require_scenes
+from drivemaps.drive import Drive, places_of, read_drive, require_scenes
 from drivemaps.geodetic import MapGrid, MapOrigin, known_origin, require_near
 from drivemaps.geojson import write_geojson
 from drivemaps.lanelet2 import SPEED_LIMIT_KMH, write_lanelet2
@@ -456,12 +456,7 @@ def place_of(ann: AnnotationFile, scenes: Sequence[str]) -> str:
     Raises:
         ValueError: If the drives are in different places, or do not exist.
     """
-    require_scenes(ann, scenes)
-    chosen = set(scenes)
-    places = set()
-    for scene, place in zip(ann.column("scene"), ann.column("map_name"), strict=True):
-        if scene in chosen:
-            places.add(place)
+    places = set(places_of(ann, scenes).values())
     if len(places) != 1:
         raise InputError(
             f"an earlier map or a prior is of one place, and the drives lie in {sorted(places)}: "
@@ -629,20 +624,21 @@ def group_scenes(
         Scenes by the name of the scene or of the place.
 
     Raises:
-        ValueError: If drives are joined, and the place of a drive is unknown.
+        ValueError: If the samples of a scene lie in several places, or if drives are joined and
+            the place of a drive is unknown.
     """
+    place_of_scene = places_of(ann, scenes)
     if not args.join:
         return {scene: [scene] for scene in scenes}
-    place_of_scene = dict(zip(ann.column("scene"), ann.column("map_name"), strict=True))
     groups: dict[str, list[str]] = {}
     for scene in scenes:
-        place = place_of_scene.get(scene)
-        if place == "":
+        place = place_of_scene[scene]
+        if not place:
             raise InputError(
                 f"--join needs the place of each drive, and {scene!r} has no map_name: leave "
                 "--join out, or choose other drives with --scene."
             )
-        groups.setdefault(place or scene, []).append(scene)
+        groups.setdefault(place, []).append(scene)
     return groups
 
 

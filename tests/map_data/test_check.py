@@ -77,3 +77,32 @@ def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, 
     caplog.clear()
     from_records(wrong, [record("a", looking, here)], AnnotationMeta("x", "ego", "v"), tmp_path)
     assert "does not contain the height of the road in the frame 'ego'" in caplog.text
+
+
+def test_scenes_of_two_places_are_named_when_a_file_is_written_and_checked(tmp_path: Path, caplog):
+    looking = [[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, -1.2], [0, 0, 0, 1]]
+    camera = {
+        "name": "front", "path": "x.jpg", "width": 640, "height": 360,
+        "intrinsics": [[400, 0, 320], [0, 400, 180], [0, 0, 1]], "cam_from_frame": looking,
+    }  # fmt: skip
+    meta = AnnotationMeta("mine", "ego", "train", ground_z_m=0.0)
+
+    def warnings(*places: tuple[str, str]) -> tuple[str, str]:
+        """Warnings of writing and of checking a file; each record has a scene and a place."""
+        caplog.clear()
+        records = [
+            {"token": str(number), "scene": scene, "map_name": place, "cameras": [camera]}
+            for number, (scene, place) in enumerate(places)
+        ]
+        from_records(tmp_path / "a.arrow", records, meta, tmp_path)
+        return caplog.text, check_files([tmp_path / "a.arrow"], None, workers=1)
+
+    munich, vienna = ("drive_001", "munich"), ("drive_001", "vienna")
+    expected = "scene 'drive_001' has samples of several places, ['munich', 'vienna'] (map_name)"
+    for text in warnings(munich, vienna, munich):
+        assert expected in text
+    for text in warnings(vienna, munich, ("x", "a"), ("x", "b"), ("y", "a")):
+        assert "scene 'drive_001' (and 1 more) has samples of several places" in text
+    # Scenes of one place, unknown places, and single frames without a scene.
+    for text in warnings(munich, ("drive_002", "vienna"), ("drive_001", ""), ("", "a"), ("", "b")):
+        assert "several places" not in text

@@ -167,6 +167,28 @@ def test_drives_of_a_place_are_joined_into_one_map(files, tmp_path, capsys):
     assert "leave --join out" in capsys.readouterr().err
 
 
+def test_a_scene_of_two_places_is_refused_before_anything_is_written(files, tmp_path):
+    results, ann = files
+    file = AnnotationFile(ann)
+    samples = list(file)
+    samples[0] = replace(samples[0], scene="later")
+    samples[5] = replace(samples[5], map_name="vienna")  # a second drive of the name "scene"
+    samples[6] = replace(samples[6], map_name="")  # unknown, which is no second place
+    write_annotations(tmp_path / "two.arrow", file.meta, samples)
+    command = [str(results), "--ann", str(tmp_path / "two.arrow"), "--out", str(tmp_path / "maps")]
+    message = r"scene 'scene' lie in several places, \['town', 'vienna'\] \(map_name\)"
+    for options in ([], ["--join"], ["--scene", "later", "scene"], ["--formats", "png"]):
+        with pytest.raises(ValueError, match=message):
+            main([*command, *options])
+    assert not (tmp_path / "maps").exists()
+    main([*command, "--scene", "later"])  # a drive of the file that lies in one place
+    assert set(os.listdir(tmp_path / "maps")) == {"later.geojson", "scores.json"}
+    samples[5] = replace(samples[5], scene="vienna1")
+    write_annotations(tmp_path / "two.arrow", file.meta, samples)
+    main([*command, "--join", "--scene", "scene", "vienna1"])
+    assert {"town.geojson", "vienna.geojson"} <= set(os.listdir(tmp_path / "maps"))
+
+
 def test_maps_of_a_model_of_another_split_are_not_scored_unless_allowed(files, tmp_path):
     results, ann = files
     here, other = ("near@" + digit * 16 for digit in "01")

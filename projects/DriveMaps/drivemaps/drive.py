@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.scene_places import scenes_of_several_places
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.utils.errors import InputError
 
@@ -191,6 +192,36 @@ def require_scenes(annotations: AnnotationFile, scenes: Iterable[str]) -> None:
             raise InputError(f"{annotations.path} has no scene {scene!r}, but {some_scenes} ...")
 
 
+def places_of(annotations: AnnotationFile, scenes: Iterable[str]) -> dict[str, str]:
+    """Place of each scene, the ``map_name`` of its samples.
+
+    Args:
+        annotations: Annotation file with the samples of the scenes.
+        scenes: Names of the scenes.
+
+    Returns:
+        Places by the name of the scene, in the order of the scenes; an unknown place is empty.
+
+    Raises:
+        ValueError: If the file lacks a scene, or the samples of a scene lie in several places.
+    """
+    places = dict.fromkeys(scenes, "")
+    require_scenes(annotations, places)
+    pairs = []
+    columns = (annotations.column("scene"), annotations.column("map_name"))
+    for scene, place in zip(*columns, strict=True):
+        if place and scene in places:
+            pairs.append((scene, place))
+    for scene, names in scenes_of_several_places(pairs).items():
+        raise InputError(
+            f"the samples of scene {scene!r} lie in several places, {names} (map_name), and a "
+            "scene is one drive: give each drive a scene name that no other drive has, or one "
+            "map_name to samples of one global frame."
+        )
+    places.update(pairs)
+    return places
+
+
 def read_drive(
     annotations: AnnotationFile,
     scenes: Sequence[str],
@@ -211,9 +242,10 @@ def read_drive(
         the maps are dropped.
 
     Raises:
-        ValueError: If the file lacks a scene, or no sample of a scene has a map.
+        ValueError: If the file lacks a scene, the samples of a scene lie in several places, or no
+            sample of a scene has a map.
     """
-    require_scenes(annotations, scenes)
+    places_of(annotations, scenes)  # raises an error for a scene of several places
     samples_of_scene: dict[str, list[MapSample]] = {scene: [] for scene in scenes}
     scene_of_row = annotations.column("scene")  # name of the scene of each sample of the file
     for row, scene in enumerate(scene_of_row):

@@ -13,6 +13,7 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.plausibility import calibration_warnings
 from gsmap.datasets.pose_plausibility import pose_warnings
+from gsmap.datasets.scene_places import place_warnings
 from gsmap.utils.cli import EachOnce
 from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_machine_error
@@ -74,7 +75,7 @@ def _broken_files(sample: MapSample, root: Path) -> list[str]:
 
 
 def _describe_content(file: AnnotationFile) -> list[str]:
-    """Describe the number of elements, and warn of implausible elements, cameras and poses."""
+    """Count the elements, and warn of implausible elements, cameras, poses and places."""
     counts = file.instance_counts()
     counts = counts[counts >= 0]  # a sample whose ground truth is not known has -1
     lines = []
@@ -94,6 +95,9 @@ def _describe_content(file: AnnotationFile) -> list[str]:
     if file.meta.has_poses:
         for warning in pose_warnings(file, file.meta.frame):
             lines.append(f"warning: poses: {warning}")
+    places = zip(file.column("scene"), file.column("map_name"), strict=True)
+    for warning in place_warnings(places):
+        lines.append(f"warning: places: {warning}")
     return lines
 
 

@@ -24,6 +24,7 @@ from gsmap.datasets.annotations.schema import whole_number
 from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size, read_image
 from gsmap.datasets.pose_plausibility import FAR_M, float32_step_m
+from gsmap.datasets.scene_places import place_warnings
 from gsmap.structures.classes import AREA_CLASSES, DIRECTED_CLASSES, LINE_CLASSES
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
@@ -192,6 +193,7 @@ def create_samples(
     """
     has_warned = False
     tokens_of: dict[str, list[str]] = {}  # tokens of the records that a warning is about
+    places: set[tuple[str, str]] = set()  # scene and map_name of the records
     count = 0
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
@@ -205,6 +207,7 @@ def create_samples(
             count += 1
             for warning in _coarse_coordinates(record):
                 tokens_of.setdefault(warning, []).append(sample.token)
+            places.add((sample.scene, sample.map_name))
             if sample.instances is not None:
                 whole = join_lines(sample.instances, meta.classes) if join else sample.instances
                 sample.instances = _clip_elements(whole, meta=meta)
@@ -221,6 +224,8 @@ def create_samples(
         tokens_of.pop(_COARSE_POSES, None)
     for warning, tokens in tokens_of.items():
         _LOGGER.warning(warning, len(tokens), count, tokens[0])
+    for line in place_warnings(places):
+        _LOGGER.warning("%s.", line)
 
 
 def _coarse_coordinates(record: Mapping[str, Any]) -> Iterator[str]:
