@@ -50,8 +50,10 @@ def test_maps_of_the_library_are_read_back(tmp_path, suffix, origin, atol):
     scored = replace(expected, scores=np.linspace(0, 1, len(expected)))
     write(path, scored, CLASSES, origin)
     found, _ = read_map(path, CLASSES, origin)
-    kept = scored.scores if suffix == "geojson" else np.ones(len(expected))
-    np.testing.assert_allclose(found.scores, kept, atol=1e-4)
+    np.testing.assert_allclose(found.scores, scored.scores, atol=1e-4)
+    unscored = replace(expected, scores=None)
+    write(path, unscored, CLASSES, origin)
+    assert (read_map(path, CLASSES, origin).elements.scores == 1).all()
 
 
 @pytest.mark.parametrize(
@@ -467,3 +469,19 @@ def test_other_scores_of_strangers_are_not_used(tmp_path, score):
     path.write_text(path.read_text().replace("{", '{"crs": null, ', 1))
     found, _ = read_map(path, CLASSES)
     assert found.scores.tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "score"),
+    [("0.3", 0.3), ("1", 1.0), ("0", 0.0), ("nan", 1.0), ("7", 1.0), ("high", 1.0), ("", 1.0)],
+)
+def test_scores_of_lines_and_crosswalks_of_lanelet2_maps_are_read(tmp_path, text, score):
+    path = tmp_path / "town.osm"
+    body = [
+        way(10, [1, 2], type="line_thin", score=text),
+        way(11, [4, 3], type="virtual"),
+        way(12, [1, 2], type="virtual"),
+        relation(20, {"left": 12, "right": 11}, type="lanelet", subtype="crosswalk", score=text),
+    ]
+    path.write_text(osm("".join(body)))
+    assert read_map(path, CLASSES).elements.scores.tolist() == [score, score]

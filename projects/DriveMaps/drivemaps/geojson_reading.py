@@ -1,7 +1,7 @@
 """Reading of GeoJSON maps, written by `write_geojson` or by other programs."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from drivemaps.map_reading import (
     ElementCollector,
     MapFile,
     finite_number,
+    score_of,
 )
 from gsmap.structures.elements import FloatArray
 from gsmap.utils.errors import InputError
@@ -128,7 +129,7 @@ def _add_feature(feature: Any, collector: ElementCollector) -> None:
     name = collector.class_of(properties or {})
     if name is None:  # `class_of` has counted the feature as unused
         return
-    score = _score_of(properties or {})
+    score = score_of(properties or {})
     coordinates = geometry.get("coordinates")
     shapes = _list_of(coordinates) if kind.startswith("Multi") else [coordinates]
     for shape in shapes:  # coordinates of one line, or of one polygon
@@ -138,15 +139,6 @@ def _add_feature(feature: Any, collector: ElementCollector) -> None:
             collector.unused["holes of polygons"] += len(rings) - 1
         else:
             collector.add(name, _line_of(shape), score=score)
-
-
-def _score_of(properties: Mapping[str, Any]) -> float:
-    """Return the property ``score`` if it is a number in [0, 1], and 1 otherwise."""
-    score = properties.get("score")
-    # True and False are integers in Python.
-    if isinstance(score, bool) or not isinstance(score, (int, float)):
-        return 1.0
-    return float(score) if 0 <= score <= 1 else 1.0
 
 
 def _outer_ring(rings: list[Any]) -> FloatArray:

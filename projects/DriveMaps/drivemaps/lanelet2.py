@@ -34,11 +34,12 @@ def write_lanelet2(
 
     Areas become polygons, which do not repeat their first node. Other closed lines repeat it at
     the end. The tags ``local_x`` and ``local_y`` of a node are its position in the global frame in
-    metres.
+    metres. The tag ``score`` of a line is the confidence of the element, as in `write_geojson`.
 
     Args:
         path: File to write.
-        elements: Map in the global frame, with x and y in metres and without heights.
+        elements: Map in the global frame, with x and y in metres and without heights. The score of
+            an element without a score is 1.
         classes: Class names in label order.
         origin: Position of the global frame on the Earth, given as a point or as a map grid.
         lanes: Lanelets of the map, written as one-way roads.
@@ -48,13 +49,13 @@ def write_lanelet2(
         RuntimeError: If ``pyproj`` is missing.
     """
     file = _OSMFile(origin)
-    for line, label, _ in elements.rows:  # vertices (P, 2), label and score
+    for line, label, score in elements.rows:  # vertices (P, 2), label and score
         # A ring has at least three different vertices, and repeats the first one at its end.
         is_ring = len(line) > 3 and bool((line[0] == line[-1]).all())
         vertices = line[:-1] if is_ring else line
         nodes = file.add_nodes(vertices)
         name = classes[label]
-        tags = {"type": TYPES.get(name, name), "class": name}
+        tags = {"type": TYPES.get(name, name), "class": name, "score": f"{score:.4f}"}
         if is_ring and name in AREA_CLASSES:
             tags["area"] = "yes"  # polygons of Lanelet2 do not repeat their first node
         elif is_ring:

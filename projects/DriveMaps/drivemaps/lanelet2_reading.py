@@ -10,7 +10,7 @@ from xml.parsers import expat
 import numpy as np
 
 from drivemaps.geodetic import MapGrid, MapOrigin
-from drivemaps.map_reading import CLASS_KEY, ClassRule, ElementCollector, MapFile
+from drivemaps.map_reading import CLASS_KEY, ClassRule, ElementCollector, MapFile, score_of
 from gsmap.structures.elements import FloatArray
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import fetch_advice
@@ -98,8 +98,9 @@ def read_lanelet2(
     """Read the line strings, polygons and crosswalks of a Lanelet2 map.
 
     A line string gets its class from the tag ``class``, or else from its type (`CLASS_OF_TYPE`). A
-    lanelet of the subtype ``crosswalk`` is an area of the class ``ped_crossing``. Positions are
-    ``local_x`` and ``local_y`` if all used nodes have them, and otherwise longitude and latitude.
+    lanelet of the subtype ``crosswalk`` is an area of the class ``ped_crossing``. The tag ``score``
+    is the confidence of an element. Positions are ``local_x`` and ``local_y`` if all used nodes
+    have them, and otherwise longitude and latitude.
     Other line strings and relations are only counted, and so are degrees that contradict the local
     positions.
 
@@ -128,11 +129,12 @@ def read_lanelet2(
     collector.unused.update(parser.num_deleted)
     uses_crosswalks = rule is None and _CROSSING in classes
     crosswalks = parser.crosswalks() if uses_crosswalks else {}
-    lines = []
+    lines = []  # class, IDs of the nodes, and score
     # IDs of ways that are bounds of crosswalks. They are part of the rings, not lines of the map.
     bound_ids: set[str] = set()
     for relation_id, relation in crosswalks.items():
-        lines.append((_CROSSING, parser.ring_of(relation_id, relation)))
+        ring = parser.ring_of(relation_id, relation)
+        lines.append((_CROSSING, ring, score_of(relation.tags)))
         bound_ids.update(relation.way_ids)
     for way_id, way in parser.ways.items():
         if way_id in bound_ids:
@@ -141,21 +143,22 @@ def read_lanelet2(
         tags = way.tags if rule else _with_class(way.tags, classes)
         class_name = collector.class_of(tags)  # None for an element that is only counted
         if class_name is not None:
-            lines.append((class_name, way.ring_or_line))
+            lines.append((class_name, way.ring_or_line, score_of(way.tags)))
     for relation_id, relation in parser.relations.items():
         if relation_id not in crosswalks:
             kind = relation.tags.get("type", "")
             collector.unused[f"relation {kind[:40]!r}"] += 1
-    is_local = parser.have_local_positions([nodes for _, nodes in lines])
+    nodes_of_lines = [nodes for _, nodes, _ in lines]
+    is_local = parser.have_local_positions(nodes_of_lines)
     if not is_local and origin is None:
         raise InputError(
             f"{path} has nodes without local_x and local_y, and the origin of the global frame is "
             "not known: give --origin or --crs."
         )
     if is_local:
-        collector.unused.update(parser.contradictions(origin, [nodes for _, nodes in lines]))
-    for class_name, nodes in lines:
-        collector.add(class_name, parser.positions(nodes, is_local=is_local))
+        collector.unused.update(parser.contradictions(origin, nodes_of_lines))
+    for class_name, nodes, score in lines:
+        collector.add(class_name, parser.positions(nodes, is_local=is_local), score=score)
     # With the origin, `finish` converts degrees to metres. Without it, lines are in metres already.
     return collector.finish(None if is_local else origin)
 

@@ -23,6 +23,8 @@ from gsmap.utils.errors import InputError
 
 CLASS_KEY = "class"
 """Property with the class of an element in the files of `write_geojson` and `write_lanelet2`."""
+SCORE_KEY = "score"
+"""Property with the confidence of an element in the files of both."""
 _MOST_VERTICES = 5_000_000  # limits the memory that an untrusted file can take
 _SMALLEST_M2 = 0.01  # a ring with a smaller area is a point or a line and is not used
 _COPY_DECIMALS = 3  # copies have equal coordinates when they are rounded to millimetres
@@ -265,6 +267,27 @@ def describe_unused(unused: Counter[str]) -> str:
     if num_others:
         parts.append(f"{num_others} x other reasons")
     return ", ".join(parts)
+
+
+def score_of(values: Mapping[str, Any]) -> float:
+    """Confidence of an element of a file.
+
+    Args:
+        values: Untrusted properties of the element. Tags of Lanelet2 files are texts.
+
+    Returns:
+        The property ``score`` if it is a number in [0, 1], also as a text, and 1 otherwise.
+    """
+    score = values.get(SCORE_KEY)
+    if isinstance(score, str):
+        try:
+            score = float(score)
+        except ValueError:
+            return 1.0
+    # True and False are integers in Python.
+    if isinstance(score, bool) or not isinstance(score, (int, float)):
+        return 1.0
+    return float(score) if 0 <= score <= 1 else 1.0
 
 
 def finite_number(value: Any) -> float:
