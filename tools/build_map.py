@@ -61,6 +61,7 @@ FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
 _LON_LAT = "_lonlat"  # ending of the names of GeoJSON files in degrees; other ones are in metres
 _SCORES = "scores.json"
 _NEAR_M = 1000.0  # an earlier map of a place lies at least in part this near to its samples
+_LISTED_PLACES = 8  # largest number of places that are printed
 _CHANGES = "changes"  # name of the file of changes, without a suffix
 # Bytes that every output of this command contains. A file without them belongs to another program.
 _MARK = b"gsmap"  # in maps
@@ -279,6 +280,34 @@ def require_positions(
             require_near(positions, where)
         elif isinstance(origin, MapGrid):
             origin.require_inside(positions, where)
+
+
+def print_grid_places(crs: str, ann: AnnotationFile, scenes: Sequence[str]) -> None:
+    """Print where a grid puts each place, as one grid may not fit all of them.
+
+    A position of another UTM zone is a possible position, too, so this cannot be checked.
+
+    Args:
+        crs: Grid of ``--crs``.
+        ann: The samples, with poses.
+        scenes: Names of the drives.
+    """
+    positions_of: dict[str, list[np.ndarray]] = {}
+    for sample in ann:
+        if sample.scene in scenes:
+            positions_of.setdefault(sample.map_name, []).append(sample.global_from_frame[:2, 3])
+    names = sorted(positions_of)
+    for name in names[:_LISTED_PLACES]:
+        middle = np.median(positions_of[name], axis=0)
+        ((longitude_deg, latitude_deg),) = MapGrid(crs).lon_lat(middle[None])
+        print(f"{crs}: place {name!r} lies at {latitude_deg:.4f} {longitude_deg:.4f} (LAT LON)")
+    if len(names) > _LISTED_PLACES:
+        print(f"{crs}: {format_count(len(names) - _LISTED_PLACES, 'more place')}")
+    if len(names) > 1:
+        print(
+            f"{crs}: it is taken for all {len(names)} places; if one lies elsewhere, such as in "
+            "another UTM zone, choose its drives with --scene, and give its own --crs"
+        )
 
 
 def require_own_files(args: argparse.Namespace, names: Iterable[str], scored: bool) -> None:
@@ -783,6 +812,8 @@ def main(argv: list[str] | None = None) -> str:
         results = read_results(args, ann)
         scenes = scenes_with_results(args, ann, results, scenes)
         print_pose_warnings(ann, scenes)
+    if args.crs is not None and ann.meta.has_poses:
+        print_grid_places(args.crs, ann, scenes)
     place = place_of(ann, scenes) if args.changes or args.prior else ""
     # Without a map_name of the samples, the prior is named after its file.
     prior_place = place or (args.prior.stem if args.prior else "")

@@ -256,6 +256,35 @@ def test_results_of_other_samples_are_refused(files, tmp_path):
         main([str(tmp_path / "other.json"), "--ann", str(files[1]), "--out", str(tmp_path)])
 
 
+def test_places_on_one_grid_are_named_with_their_latitude_and_longitude(files, tmp_path, capsys):
+    pytest.importorskip("pyproj", reason="pip install -e .[maps]")
+    results, ann = files
+    file = AnnotationFile(ann)
+    first, *others = file
+
+    def at(sample, scene, place, x, y):
+        pose = sample.global_from_frame
+        moved = rigid(pose[:3, :3], pose[:3, 3] + np.array([x, y, 0.0]))
+        return replace(sample, scene=scene, map_name=place, global_from_frame=moved, instances=None)
+
+    # Munich lies in UTM zone 32, Vienna in zone 33.
+    samples = [at(first, "v1", "vienna", 602_000, 5_340_000)]
+    samples += [at(sample, "m1", "munich", 691_000, 5_336_000) for sample in others]
+    write_annotations(tmp_path / "two.arrow", file.meta, samples)
+    words = [str(results), "--ann", str(tmp_path / "two.arrow"), "--out", str(tmp_path / "maps")]
+    munich = re.compile(r"EPSG:32632: place 'munich' lies at 48\.1\d+ 11\.5\d+ \(LAT LON\)\n")
+    main([*words, "--crs", "EPSG:32632"])
+    text = capsys.readouterr().out
+    assert munich.search(text)
+    assert re.search(r"EPSG:32632: place 'vienna' lies at 48\.2\d+ 10\.3\d+ \(LAT LON\)\n", text)
+    assert "EPSG:32632: it is taken for all 2 places; if one lies elsewhere" in text
+    main([*words, "--crs", "EPSG:32633", "--scene", "v1"])
+    text = capsys.readouterr().out
+    assert re.search(r"EPSG:32633: place 'vienna' lies at 48\.2\d+ 16\.3\d+ \(LAT LON\)\n", text)
+    assert "munich" not in text
+    assert "is taken for all" not in text
+
+
 ALL_FORMATS = ("geojson", "osm", "mcap", "mp4", "png", "svg")
 STRANGERS = (b"", b"{}", b'{"type": "FeatureCollection", "features": []}', b"x" * 300_000)
 
