@@ -338,6 +338,43 @@ def require_own_files(args: argparse.Namespace, names: Iterable[str], scored: bo
         require_own_file(args.out / _SCORES, _MARK_OF_SCORES)
 
 
+def possible_outputs(out: Path, names: Iterable[str]) -> list[Path]:
+    """Files that some options of this command write for maps, their changes and their scores.
+
+    Args:
+        out: Folder of the maps.
+        names: Name of the files of each map, without a suffix.
+    """
+    paths = []
+    for name in names:
+        paths += [out / f"{name}.{suffix}" for suffix in FORMATS]
+        paths.append(out / f"{name}{_LON_LAT}.geojson")
+    paths += [out / f"{_CHANGES}.geojson", out / f"{_CHANGES}{_LON_LAT}.geojson", out / _SCORES]
+    return paths
+
+
+def stamps_of(paths: Iterable[Path]) -> dict[Path, tuple[int, int]]:
+    """Inode and time of change of the files that exist. Both change if a file is written again."""
+    stamps = {}
+    for path in paths:
+        if path.is_file():
+            status = path.stat()
+            stamps[path] = (status.st_ino, status.st_mtime_ns)
+    return stamps
+
+
+def print_old_outputs(stamps: Mapping[Path, tuple[int, int]]) -> None:
+    """Print the outputs of an earlier run that lie beside the ones of this run.
+
+    Args:
+        stamps: Possible outputs that existed before this run, with their stamps (`stamps_of`).
+    """
+    now = stamps_of(stamps)
+    old = [str(path) for path, stamp in stamps.items() if now.get(path) == stamp]
+    if old:
+        print(f"of an earlier run, and not written by this one: {', '.join(old)}")
+
+
 def find_origin(
     args: argparse.Namespace, ann: AnnotationFile, map_name: str
 ) -> MapOrigin | MapGrid | None:
@@ -749,11 +786,41 @@ def print_pose_warnings(ann: AnnotationFile, scenes: Sequence[str]) -> None:
             print(f"poses: {line}")
 
 
+def names_of_maps(
+    args: argparse.Namespace, ann: AnnotationFile, groups: Iterable[str]
+) -> dict[str, str]:
+    """Name of the files of each map, without a suffix, by the name of the map.
+
+    Args:
+        args: The options of the command.
+        ann: The samples.
+        groups: Names of the maps: scenes, or places with ``--join``.
+
+    Raises:
+        ValueError: If a map has the file name of the changes, or an output would replace another
+            program's file.
+    """
+    # `file_names` gives each drive a safe file name. The names are chosen for all drives of the
+    # annotation file, so that the name of a drive does not depend on the selected drives. They
+    # stay different when "_lonlat" is appended to some of them.
+    all_names = ann.column("map_name" if args.join else "scene")
+    names_of_all = file_names(sorted({*all_names, *groups}), ("", _LON_LAT))
+    names = {name: names_of_all[name] for name in groups}
+    if args.changes and _CHANGES in names.values():
+        raise InputError(
+            f"drive {_CHANGES!r} has the name of the file that --changes writes: leave "
+            "--changes out, or choose other drives with --scene."
+        )
+    require_own_files(args, names=names.values(), scored=has_truth(ann))
+    return names
+
+
 def merge_drives(
     args: argparse.Namespace,
     ann: AnnotationFile,
     results: Mapping[str, MapElements],
     groups: Mapping[str, Sequence[str]],
+    names: Mapping[str, str],
 ) -> tuple[list[Pass], float]:
     """Merge drives, and write and print their maps.
 
@@ -762,28 +829,15 @@ def merge_drives(
         ann: The samples.
         results: Predictions in the annotation frames of the samples, by token.
         groups: Scenes of each map, by its name.
+        names: Name of the files of each map, without a suffix; not used without ``--out``.
 
     Returns:
         Drives with their merged maps, and the processor time of merging in seconds.
 
     Raises:
-        ValueError: If a map has the file name of the changes, an output would replace another
-            program's file, or a drive has no results.
+        ValueError: If a drive has no results.
     """
     has_poses = ann.meta.has_poses
-    # `file_names` gives each drive a safe file name. The names are chosen for all drives of the
-    # annotation file, so that the name of a drive does not depend on the selected drives. They
-    # stay different when "_lonlat" is appended to some of them.
-    all_names = ann.column("map_name" if args.join else "scene")
-    names = file_names(sorted({*all_names, *groups}), ("", _LON_LAT))
-    if args.out:
-        chosen_names = [names[name] for name in groups]
-        if args.changes and _CHANGES in chosen_names:
-            raise InputError(
-                f"drive {_CHANGES!r} has the name of the file that --changes writes: leave "
-                "--changes out, or choose other drives with --scene."
-            )
-        require_own_files(args, names=chosen_names, scored=has_truth(ann))
     passes = []
     processor_s = 0.0
     for name, scenes in groups.items():
@@ -821,10 +875,13 @@ def main(argv: list[str] | None = None) -> str:
     # Maps for the prior: the map of --map, and the map of each drive.
     maps = [open_map(args.map, args, ann, place)] if args.map else []
     passes: list[Pass] = []
+    earlier: dict[Path, tuple[int, int]] = {}  # outputs of earlier runs
     summary = f"a prior of {prior_place}"  # without results, the prior is the only output
     if args.results:
         groups = group_scenes(args, ann, scenes)
-        passes, processor_s = merge_drives(args, ann, results, groups)
+        names = names_of_maps(args, ann, groups) if args.out else {}
+        earlier = stamps_of(possible_outputs(args.out, names.values())) if args.out else {}
+        passes, processor_s = merge_drives(args, ann, results, groups, names)
         frames = sum(len(one_pass.drive.frames) for one_pass in passes)
         num_drives = sum(len(one_pass.drive.scenes) for one_pass in passes)
         numbers = f"{format_count(num_drives, 'drive')}, {format_count(frames, 'frame')}"
@@ -840,6 +897,7 @@ def main(argv: list[str] | None = None) -> str:
         write_prior(args.prior, prior_place, ann.meta.classes, maps)
     if args.out and has_truth(ann):
         score(passes, ann, args.out)
+    print_old_outputs(earlier)
     return summary
 
 

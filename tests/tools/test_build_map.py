@@ -326,6 +326,28 @@ def test_files_of_earlier_runs_and_links_are_replaced(files, tmp_path):
         assert not (tmp_path / "maps" / name).is_symlink()
 
 
+def test_outputs_of_an_earlier_run_beside_new_ones_are_named(files, tmp_path, capsys):
+    results, ann = files
+    unknown = tmp_path / "unknown.arrow"  # without ground truth, so without scores
+    file = AnnotationFile(ann)
+    write_annotations(unknown, file.meta, [replace(sample, instances=None) for sample in file])
+    out = tmp_path / "maps"
+    words = ["--out", str(out)]
+    main([str(results), "--ann", str(ann), *words, "--origin", "48", "11"])
+    main([str(results), "--ann", str(ann), *words, "--origin", "48", "11"])
+    assert "earlier run" not in capsys.readouterr().out
+    (out / "other.geojson").write_text("a map of another drive, which is not old because of this")
+    changes = ["--changes", str(out / "scene.geojson")]
+    main([str(results), "--ann", str(unknown), *words, *changes])
+    text = capsys.readouterr().out
+    old = f"{out}/scene_lonlat.geojson, {out}/scores.json"
+    assert text.endswith(f"of an earlier run, and not written by this one: {old}\n")
+    main([str(results), "--ann", str(ann), *words, "--formats", "svg"])
+    text = capsys.readouterr().out
+    old = f"{out}/scene.geojson, {out}/scene_lonlat.geojson, {out}/changes.geojson"
+    assert text.endswith(f"of an earlier run, and not written by this one: {old}\n")
+
+
 def test_a_folder_or_a_pipe_under_the_name_of_a_map_is_refused(files, tmp_path):
     results, ann = files
     words = [str(results), "--ann", str(ann), "--out", str(tmp_path)]
