@@ -45,6 +45,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.datasets.pose_plausibility import pose_warnings
 from gsmap.evaluation.core.results_json import RESULTS_KEY, THREE_D, SampleFile
+from gsmap.prior.sources import PriorSources
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, EachOnce, output_file, run_command
@@ -594,7 +595,20 @@ def compare(
     print(f"changes: {summarize_changes(comparison)}: {path}")
 
 
-def write_prior(path: Path, place: str, classes: Sequence[str], maps: list[MapElements]) -> None:
+def add_sources(sources: PriorSources, passes: Iterable[Pass]) -> None:
+    """Add the samples of drives to the sources of a prior that is made of them."""
+    for one_pass in passes:
+        for frame in one_pass.drive.frames:
+            sources.add(frame.sample.token)
+
+
+def write_prior(
+    path: Path,
+    place: str,
+    classes: Sequence[str],
+    maps: list[MapElements],
+    passes: Iterable[Pass] = (),
+) -> None:
     """Write maps of a place as a prior.
 
     Args:
@@ -602,18 +616,24 @@ def write_prior(path: Path, place: str, classes: Sequence[str], maps: list[MapEl
         place: Name of the map.
         classes: Class names in label order.
         maps: Maps in the global frame.
+        passes: Drives of which the maps were made.
     """
     from gsmap.prior import MapPrior, PriorSettings
 
     with MapPrior(PriorSettings(tuple(classes), place)) as prior:
         for elements in maps:
             prior.write_map(elements)
+        add_sources(prior.sources, passes)
         prior.save(path)
         print(f"prior of {place}, {format_count(prior.num_tiles, 'tile')}: {path}")
 
 
 def write_element_prior(
-    path: Path, place: str, classes: Sequence[str], maps: Sequence[MapElements]
+    path: Path,
+    place: str,
+    classes: Sequence[str],
+    maps: Sequence[MapElements],
+    passes: Iterable[Pass] = (),
 ) -> None:
     """Write the elements of a map of a place as a prior.
 
@@ -622,6 +642,7 @@ def write_element_prior(
         place: Name of the map.
         classes: Class names in label order.
         maps: Maps in the global frame.
+        passes: Drives of which the maps were made.
 
     Raises:
         ValueError: If there is not exactly one map. The elements of several maps may overlap.
@@ -634,6 +655,7 @@ def write_element_prior(
             "and a --map is written without results."
         )
     prior = ElementPrior(PriorSettings(tuple(classes), place), maps[0])
+    add_sources(prior.sources, passes)
     prior.save(path)
     print(f"prior of {place}, {format_count(len(prior.elements), 'element')}: {path}")
 
@@ -663,6 +685,7 @@ def write_gaussian_prior(
         elements = results[sample.token].with_coordinates(2)
         confident_elements = elements.select(elements.confidence >= thr)
         prior.write(sample.global_from_frame, extent, elements=confident_elements)
+    add_sources(prior.sources, passes)
     prior.save(path)
     print(f"prior of {place}, {format_count(prior.num_gaussians, 'Gaussian')}: {path}")
 
@@ -892,9 +915,9 @@ def main(argv: list[str] | None = None) -> str:
     if args.gaussians:
         write_gaussian_prior(args.prior, prior_place, passes, results, args.score_thr)
     elif args.elements:
-        write_element_prior(args.prior, prior_place, ann.meta.classes, maps)
+        write_element_prior(args.prior, prior_place, ann.meta.classes, maps, passes)
     elif args.prior:
-        write_prior(args.prior, prior_place, ann.meta.classes, maps)
+        write_prior(args.prior, prior_place, ann.meta.classes, maps, passes)
     if args.out and has_truth(ann):
         score(passes, ann, args.out)
     print_old_outputs(earlier)

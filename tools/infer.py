@@ -28,7 +28,7 @@ from gsmap.evaluation.core.results_json import vectors_of
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import register_folder, write_bytes
-from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
+from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, PRIORS
 from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
@@ -311,12 +311,15 @@ def open_model(args: argparse.Namespace) -> "MapInferencer":
     return inferencer
 
 
-def result_header(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, Any]:
+def result_header(
+    args: argparse.Namespace, data: dict[str, Any], priors: list[dict[str, Any]]
+) -> dict[str, Any]:
     """Header of the result file: classes, model and, if known, calibration and lists of scenes.
 
     Args:
         args: The options of the command.
         data: Meta information of the data set.
+        priors: Facts of the maps of earlier drives.
     """
     from gsmap.checkpoints.reading import read_checked
 
@@ -324,7 +327,7 @@ def result_header(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, A
     checkpoint = read_checked(path)
     header = {"classes": list(data["classes"]), CHECKPOINT: digest(path)}
     # The calibration relates the sizes of predicted Gaussians to the errors of their positions.
-    optional: dict[str, Any] = {CALIBRATION: checkpoint.calibration}
+    optional: dict[str, Any] = {CALIBRATION: checkpoint.calibration, PRIORS: priors}
     # Lists by which scenes were split: of these samples, and of the training data of the model.
     if split_list := data.get(SPLIT_LIST):
         optional[SPLIT_LIST] = split_list
@@ -553,6 +556,28 @@ def read_priors(
     )
 
 
+def describe_priors(
+    args: argparse.Namespace, priors: Sequence["AnyPrior"], tokens: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Print a warning if priors were made of the samples, and return facts for the result file.
+
+    A prior that this run updates does not contain its samples yet.
+
+    Args:
+        args: The options of the command.
+        priors: The priors of ``--prior``, before the run changes them.
+        tokens: Tokens of the samples to predict.
+    """
+    if not priors:
+        return []
+    from gsmap.apis.map_priors import facts_of_priors, leak_warnings
+
+    facts = facts_of_priors(priors, args.prior, tokens)
+    for line in leak_warnings(facts, len(tokens)):
+        print(line)
+    return facts
+
+
 def finish_priors(args: argparse.Namespace, priors: Sequence["AnyPrior"]) -> None:
     """Print which priors had nothing near samples; with ``--update-prior``, write their files."""
     if not args.update_prior:  # a prior that is updated has nothing where the vehicle is new
@@ -636,13 +661,14 @@ def main(argv: list[str] | None = None) -> str | None:
         log = open_log(args, log_settings, tokens=chosen_tokens, classes=classes)
         results = stack.enter_context(log)
         priors = read_priors(args, inferencer, dataset, chosen, stack)
+        prior_facts = describe_priors(args, priors, chosen_tokens)
         broken = predict(args, inferencer, dataset, chosen, results, priors, input_from_model)
         if chosen and len(broken) == len(chosen):
             raise no_usable_frame(broken, source.notes)
         if results:
             # Writes the result file. The manifest describes the file of a shard for the command
             # that merges shards; without ``--shard``, none is written.
-            count = results.finish(result_header(args, dataset.metainfo))
+            count = results.finish(result_header(args, dataset.metainfo, prior_facts))
             args.shard.write_manifest(
                 args.out,
                 kind=RESULTS,

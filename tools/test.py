@@ -123,6 +123,26 @@ def plain_value(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
+def describe_priors(runner: Any, priors: list[Any], paths: list[Path]) -> None:
+    """Pass facts of the priors to the result file, and warn if they were made of the samples.
+
+    Args:
+        runner: The test.
+        priors: The priors.
+        paths: Their files.
+    """
+    from gsmap.apis.map_priors import facts_of_priors, leak_warnings
+    from gsmap.utils.model_facts import PRIORS
+
+    loop = runner.test_loop
+    annotations = getattr(loop.dataloader.dataset, "annotations", None)
+    tokens = [] if annotations is None else annotations.column("token")  # a data set of the user
+    facts = facts_of_priors(priors, paths, tokens)
+    for line in leak_warnings(facts, len(tokens)):
+        runner.logger.warning(line)
+    loop.evaluator.dataset_meta = {**(loop.evaluator.dataset_meta or {}), PRIORS: facts}
+
+
 def main() -> None:
     args = parse_args()
     if args.eval == [] and not args.out:
@@ -155,6 +175,7 @@ def main() -> None:
             # In a distributed test, the model is within a wrapper.
             model = runner.model.module if is_model_wrapper(runner.model) else runner.model
             priors = use_priors(model, args.prior, stack)
+            describe_priors(runner, priors, args.prior)
         metrics = runner.test()
         for line in empty_reads(priors):
             runner.logger.warning(line)

@@ -158,7 +158,7 @@ def test_settings_and_poses_out_of_range_are_refused():
 
 def rewritten(content, path, change=lambda stored, vertices: None, pack=None):
     """Write the file again, its first tile changed."""
-    settings, rule, places = read_header(content, path, magic=ELEMENT_MAGIC)
+    settings, rule, places, _ = read_header(content, path, magic=ELEMENT_MAGIC)
     tiles = []
     for number, (key, (offset, length, _)) in enumerate(places.items()):
         packed = content[offset : offset + length]

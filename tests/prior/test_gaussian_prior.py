@@ -337,7 +337,7 @@ def test_files_of_other_settings_and_kinds_are_refused(tmp_path):
 
 def rewritten(content, path, change=None, pack=_pack, rule=None):
     """The file with changed Gaussians and right checksums."""
-    settings, found_rule, places = read_header(content, path, magic=GAUSSIAN_MAGIC)
+    settings, found_rule, places, _ = read_header(content, path, magic=GAUSSIAN_MAGIC)
     tiles = []
     for key, (offset, length, _) in places.items():
         packed = zlib.decompress(content[offset + 4 : offset + length])

@@ -12,8 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from gsmap.prior import HitMissCounts, KeepMaximum, LastSeen, MapPrior, PriorSettings
+from gsmap.prior import (
+    ElementPrior,
+    GaussianPrior,
+    HitMissCounts,
+    KeepMaximum,
+    LastSeen,
+    MapPrior,
+    PriorSettings,
+    open_prior,
+)
 from gsmap.prior.file_format import _FOOTER, _INDEX, _START, RASTER_MAGIC
+from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 
 SETTINGS = PriorSettings(("divider", "boundary"), "town")
@@ -72,6 +82,33 @@ def test_a_file_is_changed_and_saved_again(tmp_path):
 def test_a_prior_without_tiles_is_a_file(tmp_path):
     MapPrior(SETTINGS).save(tmp_path / "empty.prior")
     assert MapPrior.load(tmp_path / "empty.prior").num_tiles == 0
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: filled_prior(KeepMaximum()),
+        lambda: GaussianPrior(SETTINGS),
+        lambda: ElementPrior(SETTINGS, MapElements.from_polylines([np.eye(2)], [0])),
+    ],
+)
+def test_a_file_knows_the_samples_that_its_prior_was_made_of(make, tmp_path):
+    path = tmp_path / "town.prior"
+    prior = make()
+    prior.save(path)
+    unknown = path.read_bytes()
+    assert b"sources" not in unknown  # as files of earlier versions
+    assert open_prior(path).sources.count(["a", "b"]) == 0
+    for token in ("a", "b", "a", "", "é" * 40):
+        prior.sources.add(token)
+    prior.save(path)
+    found = open_prior(path)
+    assert len(found.sources) == 3
+    assert found.sources.count(["a", "c", "é" * 40, ""]) == 2
+    found.save(tmp_path / "again.prior")
+    assert (tmp_path / "again.prior").read_bytes() == path.read_bytes()
+    if isinstance(found, MapPrior):
+        torch.testing.assert_close(readings(found), readings(prior), rtol=0, atol=0)
 
 
 def test_two_writers_are_refused(tmp_path):
@@ -197,6 +234,11 @@ HEADER = {"classes": ["a"], "place": "t", "cell_m": 0.3, "tile_m": 60.0, "rule":
 GOOD = file_of(HEADER, [zlib.compress(bytes(40_000))])
 
 
+def sources(count, checksum=0):
+    """Header of a prior that names its sources."""
+    return {**HEADER, "sources": {"count": count, "checksum": checksum}}
+
+
 def damaged(content, position, value):
     return content[:position] + value + content[position + len(value) :]
 
@@ -234,6 +276,20 @@ HOSTILE = {
     "tile in the header": (file_of(HEADER, index=[(0, 0, 0, 10, 0)]), "outside of the file"),
     "far tile": (
         file_of(HEADER, [b"x"], [(-(2**31), 0, len(file_of(HEADER)) - _FOOTER.size, 1, 0)]),
+        "outside of the file",
+    ),
+    "sources without an end": (file_of(sources(1)), "a checksum is wrong"),
+    "changed sources": (file_of(sources(1, checksum=1), [bytes(8)], []), "a checksum is wrong"),
+    "many sources": (file_of(sources(2**40)), r"count of sources must be in \[0"),
+    "negative sources": (file_of(sources(-1)), r"count of sources must be in \[0"),
+    "sources that are no number": (file_of(sources(True)), "sources must have a count and"),
+    "sources as a list": (file_of({**HEADER, "sources": []}), "sources must have a count and"),
+    "tile in the sources": (
+        file_of(
+            sources(1, checksum=zlib.crc32(bytes(8))),
+            [bytes(8)],
+            [(0, 0, len(file_of(sources(1, checksum=zlib.crc32(bytes(8))))) - _FOOTER.size, 8, 0)],
+        ),
         "outside of the file",
     ),
     "twice": (

@@ -59,7 +59,9 @@ def test_a_prior_is_made_updated_and_only_read(model, minicity_annotations, tmp_
         return lines_of(out)
 
     first = run("first", "--prior", path, "--update-prior")
-    assert f"updated: {path}" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert f"updated: {path}" in text
+    assert "leak" not in text  # each sample is written after it is predicted
     with MapPrior.load(path) as prior:
         settings = PriorSettings(CLASSES, "boston-seaport", cell_m=0.6)
         assert prior.settings == settings
@@ -68,6 +70,13 @@ def test_a_prior_is_made_updated_and_only_read(model, minicity_annotations, tmp_
     before = digest(path)
     second = run("second", "--prior", path)
     assert digest(path) == before
+    count = len(second)
+    leak = f"leak: {count} of {count} samples are among the {count} that the prior of 'boston-sea"
+    assert leak in capsys.readouterr().out
+    fact = {"place": "boston-seaport", "made_of": count, "also_predicted": count, "digest": before}
+    assert json.loads((tmp_path / "second.json").read_text())["meta"]["priors"] == [fact]
+    (fact,) = json.loads((tmp_path / "first.json").read_text())["meta"]["priors"]
+    assert (fact["made_of"], fact["also_predicted"]) == (0, 0)
     assert second != first  # the map was empty then
     assert run("kept") == first  # without a prior, a map is kept from empty
     run("third", "--prior", path, "--update-prior")
@@ -224,6 +233,10 @@ def test_a_test_reads_a_prior(model, minicity_annotations, tmp_path):
         done = run_tool(*words, "--out", out, *options)
         assert done.returncode == 0, done.stderr[-2000:]
         found[name] = lines_of(out)
+        is_leak = name == "prior"
+        text = done.stdout + done.stderr
+        assert ("that the prior of 'boston-seaport' was made of" in text) == is_leak
+        assert ("priors" in json.loads(out.read_text())["meta"]) == is_leak
     assert digest(path) == before
     inferred = lines_of(tmp_path / "a.json")
     for token, lines in found["kept"].items():

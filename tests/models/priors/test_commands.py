@@ -48,9 +48,21 @@ def test_elements_of_a_drive_are_fused(model, minicity_annotations, tmp_path, ca
     build_map.main([*words, "--elements", "--join"])
     prior = ElementPrior.load(path)
     assert len(prior.elements) > 3
+    assert len(prior.sources) == len(content["results"]) == 2
     expected = f"prior of boston-seaport, {len(prior.elements)} elements: {path}"
     assert expected in capsys.readouterr().out
     second = lines_of(run("second", "--prior", str(path), *FUSION))
+    assert "leak: 2 of 2 samples are among the 2 that the prior" in capsys.readouterr().out
+    # A prior of one of the samples, and a run on the other one.
+    del content["results"][0]
+    first.write_text(json.dumps(content))
+    other = str(tmp_path / "other.elements")
+    build_map.main([*words[:-1], other, "--elements", "--join"])
+    run("third", "--prior", other, *FUSION)
+    assert "leak: 1 of 2 samples are among the 1 that the prior" in capsys.readouterr().out
+    tokens = [token for token in second if token != content["results"][0]["sample_token"]]
+    run("fourth", "--prior", other, "--token", *tokens, *FUSION)
+    assert "leak" not in capsys.readouterr().out
     plain = lines_of(run("plain", *FUSION))
     assert plain == lines_of(run("unset"))
     assert plain.keys() == second.keys()

@@ -3,7 +3,7 @@
 A map prior is the map of a place from earlier drives. The model reads it as a further input.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from mmengine.dist import all_reduce
 
 from gsmap.prior.map_prior import MapPrior
 from gsmap.utils.errors import InputError
+from gsmap.utils.shards import digest
 from gsmap.utils.words import format_count
 
 if TYPE_CHECKING:  # the module is slow to import, so `open_priors` imports it when it is called
@@ -99,6 +100,54 @@ def empty_reads(priors: "Sequence[AnyPrior]") -> list[str]:
         if empty == samples:
             line += ", so it changed nothing: compare its global frame with that of the poses"
         lines.append(f"{line}.")
+    return lines
+
+
+def facts_of_priors(
+    priors: "Sequence[AnyPrior]", paths: Sequence[Path], tokens: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Describe the priors of a run, for the header of its results.
+
+    Args:
+        priors: The priors, before the run changes them.
+        paths: Their files.
+        tokens: Tokens of the samples of the run.
+
+    Returns:
+        For each prior its place, the digest of its file, the number of samples that it was made of
+        (0 if they are unknown), and how many of these are samples of the run.
+    """
+    facts = []
+    for prior, path in zip(priors, paths, strict=True):
+        facts.append(
+            {
+                "place": prior.settings.place,
+                "digest": digest(path),
+                "made_of": len(prior.sources),
+                "also_predicted": prior.sources.count(tokens),
+            }
+        )
+    return facts
+
+
+def leak_warnings(facts: Sequence[Mapping[str, Any]], num_samples: int) -> list[str]:
+    """Describe how many samples of a run its priors were made of.
+
+    Args:
+        facts: Facts of the priors (`facts_of_priors`).
+        num_samples: Number of samples of the run.
+
+    Returns:
+        A line for each prior that was made of at least one sample of the run.
+    """
+    lines = []
+    for fact in facts:
+        if fact["also_predicted"]:
+            lines.append(
+                f"leak: {fact['also_predicted']} of {format_count(num_samples, 'sample')} are "
+                f"among the {fact['made_of']} that the prior of {fact['place']!r} was made of, so "
+                "their figures are too good: make the prior of other drives."
+            )
     return lines
 
 

@@ -401,7 +401,8 @@ class AtomicCheckpointHook(CheckpointHook):
                 subject="the model",
                 remedy="--cfg-options default_hooks.checkpoint.allow_other_split=True",
             )
-        loop.evaluator.dataset_meta = scored_meta | {TRAINED_ON: identity}
+        known_facts = loop.evaluator.dataset_meta or {}
+        loop.evaluator.dataset_meta = {**known_facts, **scored_meta, TRAINED_ON: identity}
 
     def before_train(self, runner: Runner) -> None:
         """Prepare the training, and run a validation that was due when the run was interrupted.

@@ -17,7 +17,7 @@ from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.evaluation.gathered_metric import GatheredMetric
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
-from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
+from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, PRIORS
 from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
 
 
@@ -152,8 +152,9 @@ class MapMetric(GatheredMetric):
         if self.out_file is not None:  # written last, so that a full disk loses no figures
             samples = ((record["token"], record["vectors"]) for record in records)
             file_meta = {"classes": list(self._meta("classes"))}
-            # The origin of the predictions: splits of the data, checkpoint, fit of the sigmas.
-            for key in (SPLIT_LIST, TRAINED_ON, CHECKPOINT, CALIBRATION):
+            # The origin of the predictions: splits of the data, checkpoint, fit of the sigmas, maps
+            # of earlier drives.
+            for key in (SPLIT_LIST, TRAINED_ON, CHECKPOINT, CALIBRATION, PRIORS):
                 if self.dataset_meta.get(key):
                     file_meta[key] = self.dataset_meta[key]
             write_results(self.out_file, samples=samples, meta=file_meta)

@@ -24,6 +24,7 @@ from gsmap.prior.file_format import (
 from gsmap.prior.inputs import Pose, planar_pose
 from gsmap.prior.reads import PriorReads
 from gsmap.prior.settings import PriorSettings
+from gsmap.prior.sources import PriorSources
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.cutting import cut_to_range
 from gsmap.structures.elements import FARTHEST_M, FloatArray, MapElements
@@ -70,6 +71,7 @@ class ElementPrior:
     Attributes:
         content: Word for the stored data in messages.
         reads: Samples at which a model has read this prior.
+        sources: Samples that this prior was made of. Whoever makes it adds their tokens.
 
     Raises:
         ValueError: If a label, a score or a vertex is out of range, an element has no length or
@@ -107,6 +109,7 @@ class ElementPrior:
         self.rule = ElementRule() if rule is None else rule
         self.elements = flat
         self.reads = PriorReads()
+        self.sources = PriorSources()
         self._bounds = bounds
 
     @classmethod
@@ -121,13 +124,13 @@ class ElementPrior:
             ValueError: If the file is no valid prior of elements, or has other settings.
         """
         path = Path(path)
-        content, file_settings, rule, entries = read_file(path, settings, magic=ELEMENT_MAGIC)
+        content, header = read_file(path, settings, magic=ELEMENT_MAGIC)
         polylines: list[FloatArray] = []
         labels: list[int] = []
         scores: list[float] = []
         num_vertices_left = _MOST_VERTICES
         # Position and checksum of each tile in `content`, the bytes of the whole file.
-        for offset, length, crc in entries.values():
+        for offset, length, crc in header.entries.values():
             packed = content[offset : offset + length]
             stored, lines = _unpack(packed, crc=crc, path=path, most_vertices=num_vertices_left)
             # The limit holds for all tiles together, so a damaged file cannot fill the memory.
@@ -137,11 +140,13 @@ class ElementPrior:
             scores += stored["score"].tolist()
         try:
             elements = MapElements.from_polylines(polylines, labels=labels, scores=scores)
-            return cls(file_settings, elements, rule)
+            prior = cls(header.settings, elements, header.rule)
         # The constructor raises an `InputError`, a ValueError, whose message lacks the path.
         except ValueError as error:
             text = str(error).rstrip(".")
             raise InputError(f"{path} is damaged: {text}; build it again.") from error
+        prior.sources = header.sources
+        return prior
 
     def save(self, path: str | Path) -> None:
         """Write the prior to a file, which replaces ``path`` when it is complete.
@@ -154,7 +159,14 @@ class ElementPrior:
             ValueError: If the tiles of the settings are too small for the extent of the map.
         """
         tiles = self._packed_tiles()
-        save_file(Path(path), self.settings, rule=self.rule, tiles=tiles, magic=ELEMENT_MAGIC)
+        save_file(
+            Path(path),
+            self.settings,
+            rule=self.rule,
+            tiles=tiles,
+            magic=ELEMENT_MAGIC,
+            sources=self.sources,
+        )
 
     def read_elements(self, pose: Pose, grid: BEVGrid) -> MapElements:
         """Read the elements in the range of a frame.

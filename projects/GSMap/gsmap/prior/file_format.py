@@ -1,8 +1,10 @@
 """File format of all kinds of map priors: a header, compressed tiles and an index.
 
 The file begins with the magic number, the version and the length of the header, all little-endian.
-The header is JSON in UTF-8. Compressed tiles (zlib) follow, then the index with the column, row,
-offset, length and checksum (CRC-32) of each tile. A footer of fixed size ends the file.
+The header is JSON in UTF-8. If the prior names the samples that it was made of, their number and
+checksum are in the header, and their digests (`PriorSources`) follow. Then there are compressed
+tiles (zlib), and the index with the column, row, offset, length and checksum (CRC-32) of each tile.
+A footer of fixed size ends the file.
 
 A rule is an object with the settings by which the states of the prior are updated. Files are
 untrusted: header, index and tiles are checked before their content is used.
@@ -24,6 +26,7 @@ from gsmap.prior.gaussian_rule import GAUSSIAN_RULES
 from gsmap.prior.inputs import reserve_file
 from gsmap.prior.rules import RULES, rule_from_settings, rule_settings
 from gsmap.prior.settings import PriorSettings
+from gsmap.prior.sources import DIGEST_BYTES, MOST_SOURCES, PriorSources
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write, fetch_advice
 
@@ -47,6 +50,8 @@ _FOOTER = struct.Struct("<QIII8s")
 _INDEX = np.dtype(
     [("column", "<i4"), ("row", "<i4"), ("offset", "<u8"), ("length", "<u4"), ("crc", "<u4")]
 )
+_SOURCES = "sources"  # key in the header
+_NO_SOURCES = {"count": 0, "checksum": 0}  # the checksum (CRC-32) of no bytes is 0
 _LONGEST_HEADER = 1 << 18  # in bytes; 65 names of 200 letters have at most 12 bytes a letter
 
 
@@ -71,12 +76,29 @@ _KINDS = {
 }
 
 
+class PriorHeader(NamedTuple):
+    """Everything in a file but its tiles.
+
+    Attributes:
+        settings: Classes, place and cells of the prior.
+        rule: Rule that computes the stored states.
+        entries: Offset, length and checksum of each tile, by column and row.
+        sources: Samples that the prior was made of; none if they are unknown.
+    """
+
+    settings: PriorSettings
+    rule: Any
+    entries: dict[TileKey, TileEntry]
+    sources: PriorSources
+
+
 def save_file(
     path: Path,
     settings: PriorSettings,
     rule: Any,
     tiles: Iterable[tuple[TileKey, bytes]],
     magic: bytes,
+    sources: PriorSources,
 ) -> None:
     """Write a file, which replaces ``path`` when it is complete.
 
@@ -86,6 +108,7 @@ def save_file(
         rule: Rule that computes the stored states.
         tiles: Column and row, and compressed states, of each tile.
         magic: First bytes of the kind of file.
+        sources: Samples that the prior was made of.
 
     Raises:
         ValueError: If another program has written the lock file.
@@ -94,14 +117,14 @@ def save_file(
     owner = reserve_file(path)  # open lock file, which reserves `path` until it is closed
     try:
         with atomic_write(path, mode="wb") as file:
-            write_tiles(file, settings, rule=rule, tiles=tiles, magic=magic)
+            write_tiles(file, settings, rule=rule, tiles=tiles, magic=magic, sources=sources)
     finally:
         owner.close()
 
 
 def read_file(
     path: Path, settings: PriorSettings | None, magic: bytes
-) -> tuple[bytes, PriorSettings, Any, dict[TileKey, TileEntry]]:
+) -> tuple[bytes, PriorHeader]:
     """Read an untrusted file, and check everything but its tiles.
 
     Args:
@@ -110,7 +133,7 @@ def read_file(
         magic: First bytes of the kind of file.
 
     Returns:
-        Content of the file, its settings and rule, and the entry of each tile.
+        Content of the file, and everything in it but the tiles.
 
     Raises:
         ValueError: If the file is no valid prior of this kind, or has other settings.
@@ -118,10 +141,10 @@ def read_file(
     content = path.read_bytes()
     if not content:
         raise InputError(f"{path} is empty: copy or build it again.")
-    file_settings, rule, entries = read_header(content, path, magic=magic)
+    header = read_header(content, path, magic=magic)
     if settings is not None:
-        settings.require_equal(file_settings, str(path))
-    return content, file_settings, rule, entries
+        settings.require_equal(header.settings, str(path))
+    return content, header
 
 
 def write_tiles(
@@ -130,6 +153,7 @@ def write_tiles(
     rule: Any,
     tiles: Iterable[tuple[TileKey, bytes]],
     magic: bytes = RASTER_MAGIC,
+    sources: PriorSources | None = None,
 ) -> None:
     """Write the content of a file.
 
@@ -139,15 +163,22 @@ def write_tiles(
         rule: Rule that computes the stored states.
         tiles: Column and row, and compressed states, of each tile.
         magic: First bytes of the kind of file.
+        sources: Samples that the prior was made of; None if they are unknown.
 
     Raises:
         ValueError: If a column or row is too large for the index.
     """
     rule_entry = rule_settings(rule, _KINDS[magic].rules)  # name and numbers of the rule
-    header = json.dumps(asdict(settings) | {"rule": rule_entry}).encode()
+    values = asdict(settings) | {"rule": rule_entry}
+    digests = b"" if sources is None else sources.to_bytes()
+    if digests:
+        num_sources = len(digests) // DIGEST_BYTES
+        values[_SOURCES] = {"count": num_sources, "checksum": zlib.crc32(digests)}
+    header = json.dumps(values).encode()
     file.write(_START.pack(magic, VERSION, len(header)))
     file.write(header)
-    offset = _START.size + len(header)
+    file.write(digests)
+    offset = _START.size + len(header) + len(digests)
     rows = []
     for (column, row), content in tiles:
         if max(abs(column), abs(row)) > FARTHEST_TILE:
@@ -160,18 +191,13 @@ def write_tiles(
     file.write(_FOOTER.pack(offset, len(rows), zlib.crc32(index), zlib.crc32(header), magic))
 
 
-def read_header(
-    content: mmap.mmap | bytes, path: Path, magic: bytes = RASTER_MAGIC
-) -> tuple[PriorSettings, Any, dict[TileKey, TileEntry]]:
+def read_header(content: mmap.mmap | bytes, path: Path, magic: bytes = RASTER_MAGIC) -> PriorHeader:
     """Read and check everything but the tiles of an untrusted file.
 
     Args:
         content: Content of the file.
         path: Name of the file, for messages.
         magic: First bytes of the kind of file.
-
-    Returns:
-        Settings, rule, and the offset, length and checksum of each tile by column and row.
 
     Raises:
         ValueError: If the file is no valid prior.
@@ -205,9 +231,14 @@ def read_header(
     index = bytes(content[offset : offset + index_size])
     if zlib.crc32(header) != header_crc or zlib.crc32(index) != index_crc:
         raise InputError(f"{path} is damaged: a checksum is wrong; copy or build it again.")
-    settings, rule = _parse_header(header, path=path, rules=kind.rules)
-    entries = _parse_index(index, path=path, start=header_end, end=offset)
-    return settings, rule, entries
+    settings, rule, sources_entry = _parse_header(header, path=path, rules=kind.rules)
+    count = sources_entry["count"]
+    tiles_start = header_end + count * DIGEST_BYTES
+    digests = bytes(content[header_end : min(tiles_start, offset)])
+    if tiles_start > offset or zlib.crc32(digests) != sources_entry["checksum"]:
+        raise InputError(f"{path} is damaged: a checksum is wrong; copy or build it again.")
+    entries = _parse_index(index, path=path, start=tiles_start, end=offset)
+    return PriorHeader(settings, rule, entries=entries, sources=PriorSources(digests))
 
 
 def _cut(path: Path) -> InputError:
@@ -217,22 +248,49 @@ def _cut(path: Path) -> InputError:
 
 def _parse_header(
     header: bytes, path: Path, rules: Mapping[str, type]
-) -> tuple[PriorSettings, Any]:
-    """Parse and check a header. Return the settings and the rule of the prior."""
+) -> tuple[PriorSettings, Any, dict[str, int]]:
+    """Parse and check a header.
+
+    Args:
+        header: JSON text.
+        path: Name of the file, for messages.
+        rules: Classes of the possible rules, by their names.
+
+    Returns:
+        Settings and rule of the prior, and number and checksum of its sources.
+
+    Raises:
+        ValueError: If the header is malformed.
+    """
     fields = ["cell_m", "classes", "place", "rule", "tile_m"]  # sorted
     try:
         values: Any = json.loads(header)
+        # Priors of earlier versions, and priors of unknown samples, have no sources.
+        sources: Any = _NO_SOURCES
+        if isinstance(values, dict):
+            sources = values.pop(_SOURCES, _NO_SOURCES)
         if not isinstance(values, dict) or sorted(values) != fields:
             raise InputError(f"the header must have the fields {fields}.")
         if not isinstance(values["classes"], list):
             raise InputError("classes must be a list.")
+        _require_sources(sources)
         rule = rule_from_settings(values.pop("rule"), rules)
-        return PriorSettings(**values), rule
+        return PriorSettings(**values), rule, sources
     # A TypeError is raised for a list instead of a name, a RecursionError for deeply nested JSON.
     # An `InputError` is a ValueError, so the two above get the path of the file here, too.
     except (ValueError, TypeError, RecursionError) as error:
         text = str(error).rstrip(".")
         raise InputError(f"{path} is damaged: {text}; build it again.") from error
+
+
+def _require_sources(entry: Any) -> None:
+    """Raise ValueError if the entry of the sources in a header is malformed."""
+    is_valid = isinstance(entry, dict) and entry.keys() == _NO_SOURCES.keys()
+    # True and False are integers in Python.
+    if not is_valid or any(type(number) is not int for number in entry.values()):
+        raise InputError(f"{_SOURCES} must have a count and a checksum.")
+    if not 0 <= entry["count"] <= MOST_SOURCES:
+        raise InputError(f"the count of {_SOURCES} must be in [0, {MOST_SOURCES}].")
 
 
 def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey, TileEntry]:

@@ -30,6 +30,7 @@ from gsmap.prior.gaussian_updates import (
 from gsmap.prior.inputs import PlanarPose, Pose, Raster, planar_pose, to_numpy
 from gsmap.prior.reads import PriorReads
 from gsmap.prior.settings import PriorSettings
+from gsmap.prior.sources import PriorSources
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
@@ -88,6 +89,7 @@ class GaussianPrior:
     Attributes:
         content: Name of the stored objects, for messages.
         reads: Samples at which a model has read this prior.
+        sources: Samples that this prior was made of. Whoever makes it adds their tokens.
     """
 
     content: ClassVar[str] = "Gaussians"
@@ -96,6 +98,7 @@ class GaussianPrior:
         self.settings = settings
         self.rule = GaussianRule() if rule is None else rule
         self.reads = PriorReads()
+        self.sources = PriorSources()
         self._tiles: dict[TileKey, Stored] = {}
         self._lock = threading.RLock()
 
@@ -113,12 +116,13 @@ class GaussianPrior:
         """
         path = Path(path)
         # Each entry is the offset, length and checksum of a tile in `content`.
-        content, file_settings, rule, entries = read_file(path, settings, magic=GAUSSIAN_MAGIC)
-        prior = cls(file_settings, rule)
-        for key, (offset, length, crc) in entries.items():
+        content, header = read_file(path, settings, magic=GAUSSIAN_MAGIC)
+        prior = cls(header.settings, header.rule)
+        prior.sources = header.sources
+        for key, (offset, length, crc) in header.entries.items():
             packed = content[offset : offset + length]
             stored = _unpack(packed, crc=crc, path=path)
-            _check_stored(stored, settings=file_settings, path=path)
+            _check_stored(stored, settings=header.settings, path=path)
             prior._tiles[key] = stored
         return prior
 
@@ -142,7 +146,14 @@ class GaussianPrior:
                 )
             # The order of the keys makes the files of equal priors equal.
             tiles = [(key, _pack(self._tiles[key])) for key in sorted(self._tiles)]
-            save_file(Path(path), self.settings, rule=self.rule, tiles=tiles, magic=GAUSSIAN_MAGIC)
+            save_file(
+                Path(path),
+                self.settings,
+                rule=self.rule,
+                tiles=tiles,
+                magic=GAUSSIAN_MAGIC,
+                sources=self.sources,
+            )
 
     @property
     def num_gaussians(self) -> int:

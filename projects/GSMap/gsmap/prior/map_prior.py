@@ -18,6 +18,7 @@ from gsmap.prior.inputs import Pose, Raster, planar_pose, reserve_file, to_numpy
 from gsmap.prior.reads import PriorReads
 from gsmap.prior.rules import HitMissCounts, States, WriteRule
 from gsmap.prior.settings import PriorSettings
+from gsmap.prior.sources import PriorSources
 from gsmap.prior.tiles import TileStore
 from gsmap.prior.vectors import covered_cells
 from gsmap.structures.elements import MapElements
@@ -56,6 +57,7 @@ class MapPrior:
 
     Attributes:
         reads: Samples at which a model has read this prior.
+        sources: Samples that this prior was made of. Whoever writes them adds their tokens.
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class MapPrior:
         self.settings = settings
         self.rule: WriteRule = HitMissCounts() if rule is None else rule
         self.reads = PriorReads()
+        self.sources = PriorSources()
         side = settings.tile_cells
         num_classes = len(settings.classes)
         tile_shape = (self.rule.num_states, num_classes, side, side)
@@ -109,10 +112,9 @@ class MapPrior:
         try:
             mapped = _map_file(path)
             try:
-                # `tile_entries` has the offset, length and checksum of each tile.
-                file_settings, rule, tile_entries = read_header(mapped, path)
+                header = read_header(mapped, path)
                 if settings is not None:
-                    settings.require_equal(file_settings, str(path))
+                    settings.require_equal(header.settings, str(path))
             except BaseException:
                 mapped.close()
                 raise
@@ -120,8 +122,9 @@ class MapPrior:
             if owner is not None:
                 owner.close()
             raise
-        prior = cls(file_settings, rule, memory_bytes=memory_bytes)
-        prior._tiles.open(mapped, path=path, entries=tile_entries)
+        prior = cls(header.settings, header.rule, memory_bytes=memory_bytes)
+        prior.sources = header.sources
+        prior._tiles.open(mapped, path=path, entries=header.entries)
         prior._owner = owner
         prior._owned_path = path.resolve() if update else None
         return prior
@@ -152,13 +155,14 @@ class MapPrior:
                         self.settings,
                         rule=self.rule,
                         tiles=self._tiles.packed_tiles(),
+                        sources=self.sources,
                     )
                 # From here on, tiles are read from the new file. If ``path`` is a device file or a
                 # pipe, it cannot be read.
                 if path.is_file():
                     mapped = _map_file(path)
-                    _, _, tile_entries = read_header(mapped, path)
-                    self._tiles.open(mapped, path, entries=tile_entries)
+                    header = read_header(mapped, path)
+                    self._tiles.open(mapped, path, entries=header.entries)
             finally:
                 if owner is not None:
                     owner.close()

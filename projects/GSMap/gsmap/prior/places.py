@@ -160,6 +160,7 @@ class PlaceMaps:
             prior = self.find_or_create(place)
             assert isinstance(prior, MapPrior)  # `GivenMaps` refuses other priors if it writes
             prior.write(place.pose, self.grid, values=raster)
+            prior.sources.add(place.token)
 
 
 class GivenMaps(PlaceMaps):

@@ -10,6 +10,7 @@ from typing import Any, cast
 from gsmap.utils.errors import InputError
 
 CHECKPOINT = "checkpoint"  # key in results: SHA-256 of the checkpoint file
+PRIORS = "priors"  # key in results: place, digest and sources of each map of earlier drives
 CALIBRATION = "calibration"  # key in checkpoints and results; the value has law and sigmas
 # Key of metainfo: transform from the annotation frame to the ground below the rear axle.
 MOUNT = "mount"
