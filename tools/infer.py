@@ -312,14 +312,14 @@ def open_model(args: argparse.Namespace) -> "MapInferencer":
 
 
 def result_header(
-    args: argparse.Namespace, data: dict[str, Any], priors: list[dict[str, Any]]
+    args: argparse.Namespace, data: dict[str, Any], priors: Sequence[Mapping[str, Any]] = ()
 ) -> dict[str, Any]:
     """Header of the result file: classes, model and, if known, calibration and lists of scenes.
 
     Args:
         args: The options of the command.
         data: Meta information of the data set.
-        priors: Facts of the maps of earlier drives.
+        priors: Facts of the maps of earlier drives (`describe_priors`).
     """
     from gsmap.checkpoints.reading import read_checked
 
