@@ -267,6 +267,8 @@ def require_positions(
 ) -> None:
     """Check that the positions of samples fit the places of their global frames.
 
+    A warning is printed if longitudes and latitudes of a grid are not accurate.
+
     Args:
         ann: The samples.
         origins: Places of the global frames; None is unknown.
@@ -281,6 +283,9 @@ def require_positions(
             require_near(positions, where)
         elif isinstance(origin, MapGrid):
             origin.require_inside(positions, where)
+            warning = origin.accuracy_warning(positions)
+            if warning is not None:
+                print(f"warning: {warning}")
 
 
 def print_grid_places(crs: str, ann: AnnotationFile, scenes: Sequence[str]) -> None:

@@ -2,7 +2,9 @@ import json
 import math
 import re
 import sys
+import warnings
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import MagicMock
 
 import av
@@ -343,6 +345,39 @@ def test_local_positions_are_no_coordinates_of_a_grid(crs, position, is_inside):
         ValueError, match=rf"a: the position .* outside of .*{crs}.*give its --orig"
     ):
         MapGrid(crs).require_inside(positions, "a")
+
+
+@pytest.mark.parametrize(
+    ("crs", "position", "file"),
+    [
+        ("EPSG:27700", (651_409.8, 313_177.5), "uk_os_OSTN15_NTv2_OSGBtoETRS.tif"),
+        ("EPSG:31468", (4_470_315.0, 5_329_181.0), "de_adv_BETA2007.tif"),
+        ("EPSG:26710", (500_000.0, 4_400_000.0), "us_noaa_conus.tif"),
+        ("EPSG:26710", (500_000.0, 6_100_000.0), "ca_nrc_ntv2_0.tif"),
+        ("EPSG:32650", (500_000.0, 4_429_000.0), None),
+        ("EPSG:25832+7837", (693_566.0, 5_330_684.0), None),
+        ("EPSG:2056", (2_600_000.0, 1_200_000.0), None),
+        ("EPSG:5514", (-744_430.0, -1_043_628.0), None),
+        ("EPSG:3832", (3_300_000.0, 100_000.0), None),
+    ],
+)
+def test_grids_without_their_file_of_corrections_are_named(crs, position, file):
+    """If the file is installed here, there is nothing to name."""
+    datadir = pytest.importorskip("pyproj.datadir", reason="pip install -e .[maps]")
+    network = pytest.importorskip("pyproj.network", reason="pip install -e .[maps]")
+    folders = [datadir.get_data_dir(), datadir.get_user_data_dir()]
+    is_installed = file is not None and any(Path(folder, file).exists() for folder in folders)
+    if is_installed or network.is_network_enabled():
+        pytest.skip(f"{file} is installed or downloaded")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # of pyproj
+        text = MapGrid(crs).accuracy_warning(np.array([position]))
+    if file is None:
+        assert text is None
+        return
+    assert text.startswith(f"longitude and latitude in {crs} (")
+    assert re.search(r"only accurate to \d+ m ", text)
+    assert f"pyproj sync --file {file}" in text
 
 
 @pytest.mark.parametrize(

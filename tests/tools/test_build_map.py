@@ -14,6 +14,7 @@ import shapely
 import torch
 from drive_cases import CLASSES, curve, drive_of, street
 
+from drivemaps.geodetic import MapGrid
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance
 from gsmap.datasets.elements import elements_of_instances
@@ -21,7 +22,7 @@ from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.prior import MapPrior, PriorSettings, open_prior
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
-from tools.build_map import main
+from tools.build_map import main, require_positions
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,19 @@ def test_ground_truth_as_predictions_scores_1(files, tmp_path, capsys):
     assert picture.shape[1] == 1500
     orange = np.abs(picture[..., ::-1].astype(int) - [255, 149, 0]).max(axis=-1) < 4
     assert orange.mean() > 1e-3  # the dividers, in the colour of all pictures
+
+
+def test_a_grid_without_its_file_of_corrections_is_named(capsys, monkeypatch):
+    pytest.importorskip("pyproj", reason="pip install -e .[maps]")
+    sample = drive_of().frames[0].sample
+    pose = rigid(np.eye(3), np.array([651_409.8, 313_177.5, 0]))
+    samples = [replace(sample, global_from_frame=pose)]
+    monkeypatch.setattr(MapGrid, "accuracy_warning", lambda *_: "only accurate to 2 m")
+    require_positions(samples, [MapGrid("EPSG:27700")], "a")
+    assert capsys.readouterr().out == "warning: only accurate to 2 m\n"
+    monkeypatch.setattr(MapGrid, "accuracy_warning", lambda *_: None)
+    require_positions(samples, [MapGrid("EPSG:27700"), None], "a")
+    assert capsys.readouterr().out == ""
 
 
 def test_poses_that_cannot_be_right_are_named(files, tmp_path, capsys):

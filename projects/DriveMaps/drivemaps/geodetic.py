@@ -1,5 +1,6 @@
 """Position of the global frame of a map on the Earth."""
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -212,6 +213,43 @@ class MapGrid:
                 f"from a metre on the ground at the position {x:.0f} {y:.0f}: transform the poses "
                 "to a grid of the place, such as its UTM zone."
             )
+
+    def accuracy_warning(self, positions: FloatArray) -> str | None:
+        """Describe the error of longitude and latitude if ``pyproj`` lacks a file of corrections.
+
+        National grids of older surveys need such files, which ``pyproj`` does not contain. Without
+        them it uses a transformation that is some metres off.
+
+        Args:
+            positions: Positions of the vehicle inside of the grid (`require_inside`), in metres.
+                (n >= 1, >= 2)
+
+        Returns:
+            Warning, or None if the most accurate transformation is available.
+        """
+        pyproj = import_extra("pyproj", "maps")
+        create_group = import_extra("pyproj.transformer", "maps").TransformerGroup
+        create_area = import_extra("pyproj.aoi", "maps").AreaOfInterest
+        lon_lat = self.lon_lat(positions)
+        west_deg, south_deg = lon_lat.min(axis=0)
+        east_deg, north_deg = lon_lat.max(axis=0)
+        area = create_area(west_deg, south_deg, east_deg, north_deg)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pyproj, about the missing file
+            group = create_group(self.crs, "EPSG:4326", always_xy=True, area_of_interest=area)
+        if group.best_available or not group.transformers:
+            return None
+        best = group.unavailable_operations[0]
+        names = [grid.short_name for grid in best.grids if not grid.available]
+        accuracy_m = group.transformers[0].accuracy  # of the transformation in use; -1 if unknown
+        stated = f"{accuracy_m:g}" if accuracy_m > 0 else "an unknown number of"
+        system = pyproj.CRS.from_user_input(self.crs)
+        commands = " and ".join(f"pyproj sync --file {name}" for name in names)
+        return (
+            f"longitude and latitude in {self.crs} ({system.name}) are only accurate to "
+            f"{stated} m (as pyproj states, at some places less), as pyproj lacks files of the "
+            f"best transformation: get them by {commands}. Maps written in metres are not affected."
+        )
 
     @cached_property
     def _transformer(self) -> Any:
