@@ -5,7 +5,8 @@ Examples:
     python tools/export.py CONFIG CHECKPOINT --out model.onnx --check 5
     python tools/export.py CONFIG CHECKPOINT --out model_int8.onnx --int8 --calibration train.arrow
 
-The config sets the cameras. The image size is the size of its test samples, or ``--size``.
+The config sets the cameras: all cameras of the training or some, in any order. The image size is
+the size of its test samples, or ``--size``.
 """
 
 # Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
@@ -127,7 +128,7 @@ def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInfe
         args: The options of the command.
 
     Raises:
-        ValueError: If the config lists no cameras.
+        ValueError: If the config lists no cameras, or the model cannot be exported.
     """
     options = inferencer.cfg.test_dataloader.dataset
     if not options.get("cameras"):

@@ -338,6 +338,7 @@ def main() -> str:
     from mmengine.logging import MMLogger
 
     from gsmap.apis.loading import load_model
+    from gsmap.apis.trained_cameras import use_cameras_of
     from gsmap.visualization.figure import save_figure
     from gsmap.visualization.plots import plot_severities
 
@@ -357,6 +358,7 @@ def main() -> str:
     # Without a logger of this level, the metric would log a table for each case.
     MMLogger.get_instance("robustness", log_level="ERROR")
     dataset = DATASETS.build(model.cfg.test_dataloader.dataset)
+    use_cameras_of(model, dataset)
     indices = measured_indices(dataset, args.samples)
     severities = severities_of(args.kinds, dataset=dataset, indices=indices)
     notes = notes_on(severities)

@@ -150,8 +150,9 @@ def main() -> None:
     from mmengine.model import is_model_wrapper
 
     from gsmap.apis.map_priors import empty_reads, use_priors
+    from gsmap.apis.trained_cameras import TrainedCamerasHook
     from gsmap.checkpoints.building import building
-    from gsmap.checkpoints.reading import adopt_settings
+    from gsmap.checkpoints.reading import adopt_settings, read_checked
     from gsmap.checkpoints.settings import dataset_of
     from gsmap.engine.launch import load_config
     from gsmap.engine.map_agreement import check_map_agreement
@@ -161,7 +162,8 @@ def main() -> None:
     cfg = load_config(args, for_training=False)
     dataset_of(cfg, "test")  # raises an error if there is none
     # The model gets the settings with which the checkpoint was trained. Notes name the changes.
-    notes = adopt_settings(cfg, checkpoint, args.cfg_options)
+    contents = read_checked(checkpoint)
+    notes = adopt_settings(cfg, checkpoint, args.cfg_options, checkpoint=contents)
     cfg.load_from = str(checkpoint)
     apply_options(cfg, args)
     if notes and is_first_rank():  # one of several processes prints
@@ -170,6 +172,7 @@ def main() -> None:
     # `building` adds the names of the config's parts to errors. The stack closes the priors.
     with building(cfg), ExitStack() as stack:
         runner = MapRunner.from_cfg(cfg)
+        runner.register_hook(TrainedCamerasHook(args.config, checkpoint, contents))
         priors = []
         if args.prior:
             # In a distributed test, the model is within a wrapper.

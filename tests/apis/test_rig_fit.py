@@ -11,7 +11,7 @@ from mmdet3d.registry import MODELS
 from mmengine.registry import init_default_scope
 from model_cases import build_small, small_config
 
-from gsmap.apis.rig_fit import RigFitHook, _training_facts, fit_start, similar_cameras
+from gsmap.apis.rig_fit import RigFitHook, fit_start, similar_cameras, training_facts
 from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.structures.grid import BEVGrid
@@ -267,11 +267,11 @@ def test_unknown_cameras_start_from_the_mean():
 
 
 def test_what_a_checkpoint_says_of_its_origin_is_checked():
-    assert _training_facts("a.pth", {}) == {}
-    assert _training_facts("a.pth", {"meta": {"dataset_meta": 3}}) == {}
+    assert training_facts("a.pth", None) == {}
+    assert training_facts("a.pth", 3) == {}
     said = {"cameras": ["front", 3], "classes": 7, "frame": "ego", "x_range": ("a", 1.0)}
-    assert _training_facts("a.pth", {"meta": {"dataset_meta": said}}) == {"frame": "ego"}
-    known = _training_facts(find_checkpoint("gsmap_r18_minicity"), {"state_dict": {}})
+    assert training_facts("a.pth", said) == {"frame": "ego"}
+    known = training_facts(find_checkpoint("gsmap_r18_minicity"), {})
     assert (known["frame"], known["x_range"]) == ("lidar", [-15.0, 15.0])
     assert known["cameras"] == list(NUSCENES)
 

@@ -236,15 +236,23 @@ def export_onnx(
     Args:
         model: A `MapDetector` with its weights on the CPU. It is set to evaluation mode.
         out: File to write.
-        cameras: Names of the cameras, in the order of the images.
+        cameras: Names of the cameras, in the order of the images. They must be the
+            ``camera_names`` of a model of ``load_model``, which has chosen these by its config.
         image_size: Rows and columns of the images of the data pipeline, in pixels.
         frame: Annotation frame, for the metadata: ``"lidar"`` or ``"ego"``.
 
     Raises:
         RuntimeError: If the packages of the extra ``onnx`` are not installed.
-        ValueError: If the model cannot be exported (`ExportedDetector`), has another number of
-            cameras, or needs an operator that ONNX does not have.
+        ValueError: If the model cannot be exported (`ExportedDetector`), has other cameras, or
+            needs an operator that ONNX does not have.
     """
+    names = getattr(model, "camera_names", None)  # None if the cameras have no embeddings
+    if names is not None and list(cameras) != list(names):
+        raise InputError(
+            f"the model has embeddings of the cameras {', '.join(names)}, got the cameras "
+            f"{', '.join(cameras)}: set test_dataloader.dataset.cameras to all or some cameras of "
+            "the model, in any order, and give the file images of your cameras in their places."
+        )
     onnx = import_extra("onnx", "onnx")
     import_extra("onnxscript", "onnx")  # a dependency of torch's exporter
     exported = ExportedDetector(model).eval()
@@ -453,7 +461,8 @@ def _with_cameras_of(inferencer: OnnxInferencer, dataset: Any) -> Any:
         raise InputError(
             f"{inferencer.path.name} takes the cameras {', '.join(inferencer.cameras)}; those of "
             f"the samples, {', '.join(names)}, are not one for each of them by name or direction: "
-            "name them as the model does, or export for other cameras."
+            "name them as the model does, or export for fewer cameras "
+            "(test_dataloader.dataset.cameras)."
         )
     dataset = copy.copy(dataset)  # the caller's data set keeps its cameras
     dataset.cameras = tuple(names[index] for index in np.argsort(rows))

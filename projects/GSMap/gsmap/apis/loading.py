@@ -10,8 +10,9 @@ import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
 
+from gsmap.apis.trained_cameras import choose_cameras, trained_cameras
 from gsmap.checkpoints.building import building
-from gsmap.checkpoints.named_models import named_models
+from gsmap.checkpoints.named_models import find_checkpoint, named_models
 from gsmap.checkpoints.reading import Checkpoint, adopt_settings, load_weights, read_checked
 from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.source import Mount
@@ -51,6 +52,10 @@ def load_model(
         * ``cfg``: Its config, with the settings of its training.
         * ``mount``: Pose of its annotation frame on the vehicle of the training data (`Mount`).
         * ``rig``: Cameras of the training data by name: width, height, fx, fy, cx, cy in pixels.
+        * ``camera_names``: Names of the cameras in the order of the encoder's embeddings of
+          cameras. If the cameras of the test data are cameras of the training, the model has the
+          embeddings of these, in their order; otherwise it has those of the training. None if the
+          encoder has no such embeddings, or their cameras are unknown.
         * ``training_dataset``: Name of the training's data set; empty if unknown.
         * ``without_signals``: Whether the training data is known to lack vehicle signals (CAN bus).
 
@@ -63,7 +68,8 @@ def load_model(
     if checkpoint is None and str(config) in named_models():
         checkpoint = str(config)
     # The file is read once, and the functions below share its contents.
-    contents = None if checkpoint is None else read_checked(checkpoint)
+    file = None if checkpoint is None else find_checkpoint(checkpoint)
+    contents = None if file is None else read_checked(file)
     with building(cfg):  # adds the names of the config and of its parts to errors
         if checkpoint is not None:
             # A line for each setting that differs between the config and the checkpoint.
@@ -75,6 +81,10 @@ def load_model(
     if checkpoint is not None:
         load_weights(model, path=checkpoint, checkpoint=contents)
     model.cfg = cfg
+    trained = trained_cameras(model, config=config, cfg=cfg, path=file, checkpoint=contents)
+    model.camera_names = choose_cameras(
+        model, trained=trained, wanted=cfg.test_dataloader.dataset.get("cameras")
+    )
     model.mount = _training_mount(cfg, contents=contents, path=checkpoint)
     # A checkpoint without settings is from an earlier version, which did not record whether the
     # training data had vehicle signals.

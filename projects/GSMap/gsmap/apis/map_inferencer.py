@@ -29,6 +29,7 @@ from gsmap.apis.input_dataset import open_dataset
 from gsmap.apis.live_map import LiveMap
 from gsmap.apis.loading import load_model
 from gsmap.apis.map_priors import maps_for
+from gsmap.apis.rig_fit import camera_names, camera_rows
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.settings import single_dataset_of
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -273,12 +274,10 @@ class MapInferencer:
 
         Returns:
             The data set, without cameras that are left out, and for each of its cameras the index
-            of the trained camera; None for a model without embeddings of cameras.
+            of the trained camera; None for a model without embeddings of cameras, or with
+            embeddings of unknown cameras.
         """
-        trained = self.cfg.test_dataloader.dataset.get("cameras")
-        if trained is None or dataset.cameras is None:
-            return dataset, None
-        if allow_missing_cameras:
+        if allow_missing_cameras and dataset.cameras is not None:
             available: set[str] = set()  # cameras that a sample or more has
             for index in range(len(dataset)):
                 for camera in dataset.sample(index).cameras:
@@ -287,10 +286,12 @@ class MapInferencer:
             if cameras:
                 dataset = copy.copy(dataset)  # the caller's data set keeps its cameras
                 dataset.cameras = cameras
-        if getattr(self.model.bev_encoder, "cams_embeds", None) is None:
+        trained = self.model.camera_names
+        if trained is None:
             return dataset, None
-        from gsmap.apis.rig_fit import camera_rows
-
+        if dataset.cameras is None:  # each sample would have its cameras in an order of its own
+            dataset = copy.copy(dataset)
+            dataset.cameras = tuple(camera_names(dataset))
         return dataset, camera_rows(dataset, trained=trained)
 
     @contextmanager

@@ -331,7 +331,8 @@ class OnnxInferencer:
         if len(images) != len(self.cameras):
             raise InputError(
                 f"{self.path.name} takes {len(self.cameras)} cameras, {', '.join(self.cameras)}, "
-                f"got {len(images)} images: give one of each, or export for other cameras."
+                f"got {len(images)} images: give one of each, or export for fewer cameras "
+                "(test_dataloader.dataset.cameras)."
             )
         rows, columns = self.image_size
         brightest = 0.0  # of the images in floating point

@@ -378,28 +378,29 @@ class RigFitHook(Hook):
         if is_upstream(weights):  # keys of the code of the model's authors
             weights = ours_from_upstream(weights)
         model = getattr(runner.model, "module", runner.model)
-        origin = _training_facts(runner._load_from, checkpoint=checkpoint)
+        meta: Any = checkpoint.get("meta") or {}
+        origin = training_facts(runner._load_from, dataset_meta=meta.get("dataset_meta"))
         for line in fit_start(weights, model=model, dataset=dataset, origin=origin):
             print_log(f"{runner._load_from}: {line}", logger="current")
         state.clear()  # the runner loads this dictionary, so it is changed in place
         state.update(weights)
 
 
-def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect facts about the training of a checkpoint, for `fit_start`.
+def training_facts(path: Any, dataset_meta: Any) -> dict[str, Any]:
+    """Collect facts about the training of a checkpoint.
 
     They are taken from the metadata of the checkpoint. If the checkpoint of a named model has no
     metadata, they are taken from the model's config. Facts of a wrong type are left out.
 
     Args:
         path: File of the checkpoint.
-        checkpoint: Contents of the file.
+        dataset_meta: Metadata of the training's data set in the file, not checked; None or empty
+            if it has none.
 
     Returns:
         The known facts among ``cameras``, ``classes``, ``frame``, ``x_range`` and ``y_range``.
     """
-    meta: Any = checkpoint.get("meta") or {}
-    metadata: Any = meta.get("dataset_meta") or {}
+    metadata: Any = dataset_meta or {}
     for model in named_models().values():
         if not metadata and Path(str(path)) == model.file:
             config = Config.fromfile(shipped_path(model.config))
