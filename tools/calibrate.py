@@ -130,9 +130,10 @@ def main() -> str:
         cfg.model.map_head.temperatures = factors.round(4).tolist()
     meta = {  # read when the checkpoint is loaded or tested
         MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())),
-        SIGNALS: source.can_bus,
         CALIBRATION: {"law": args.law, "sigmas": args.sigmas},
     }
+    if source.can_bus or source.without_signals:  # otherwise it is unknown
+        meta[SIGNALS] = source.can_bus
     if source.dataset_meta:  # with it, a test can warn about samples of the training's split
         meta["dataset_meta"] = dict(source.dataset_meta)
     if source.image_size:

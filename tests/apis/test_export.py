@@ -398,6 +398,17 @@ def test_arrays_that_are_not_finite_are_named(small, value):
         small.prepare(images, meta)
 
 
+def test_a_file_of_a_model_that_was_trained_without_signals_uses_none(small_onnx, caplog):
+    exported = OnnxInferencer(small_onnx, num_threads=1)
+    images = np.zeros((6, 64, 96, 3), np.uint8)
+    meta = {"lidar2img": ring_of_cameras(NUM_CAMS, *IMAGE_SHAPE), "can_bus": np.arange(18.0)}
+    assert exported.prepare(images, meta)["can_bus"].any()
+    exported.metadata["can_bus"] = signals_rule(SimpleNamespace(without_signals=True))
+    for given in (meta["can_bus"], None, meta["can_bus"]):
+        assert not exported.prepare(images, {**meta, "can_bus": given})["can_bus"].any()
+    assert caplog.text.count("trained without vehicle signals; zeros are taken") == 1
+
+
 def test_half_precision_and_8_bits_stay_close(small, tmp_path):
     import onnx
 

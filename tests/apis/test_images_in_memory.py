@@ -153,6 +153,21 @@ def test_missing_signals_are_named_once_if_the_model_was_trained_with_signals(
     assert caplog.text.count("trained with vehicle signals") == 1
 
 
+def test_given_signals_are_not_used_by_a_model_that_was_trained_without(
+    inferencer, tmp_path, caplog, monkeypatch
+):
+    (sample,) = make_samples(tmp_path, 1)
+    images, *rig = in_memory(sample, tmp_path)
+    monkeypatch.setitem(inferencer.cfg.test_dataloader.dataset, "zero_signals", True)
+    live = inferencer.live(*rig)
+    standing = live.predict(images).pred_instances_3d.pts
+    assert "vehicle signals" not in caplog.text
+    for _ in range(2):
+        found = live.predict(images, np.arange(18.0)).pred_instances_3d.pts
+        assert torch.equal(found, standing)
+    assert caplog.text.count("without vehicle signals: can_bus is not used") == 1
+
+
 def test_a_live_rig_continues_a_stream_as_the_drive_does(inferencer, tmp_path):
     """The calibration is that of the vehicle, and so is the pose; the model's is the LiDAR."""
     samples, remembering = drive(tmp_path, 2), make_remembering()

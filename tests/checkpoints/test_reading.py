@@ -147,6 +147,17 @@ def test_test_data_are_as_those_that_the_checkpoint_was_trained_on(small, tmp_pa
     assert small.test_dataloader.dataset.signals_from_poses is True  # the named model's were given
 
 
+def test_test_data_have_no_signals_if_the_training_had_none(tmp_path):
+    for meta, wanted in (({"can_bus": False}, True), ({"can_bus": True}, None), ({}, None)):
+        path = save(tmp_path / "a.pth", {"state_dict": {"w": torch.ones(1)}, "meta": meta})
+        cfg = read_config("configs/maptr/maptr_r18_minicity.py")
+        adopt_settings(cfg, path, None)
+        assert cfg.test_dataloader.dataset.get("zero_signals") is wanted
+    cfg.test_dataloader.dataset.zero_signals = False  # asked for by hand
+    adopt_settings(cfg, save(tmp_path / "a.pth", {"state_dict": {"w": torch.ones(1)}}), None)
+    assert cfg.test_dataloader.dataset.zero_signals is False
+
+
 @pytest.mark.parametrize("size", [3, [3], ["a", "b"], [0, 5], [1, 10**9], [1.5, 2], [1, 2, 3]])
 def test_an_image_size_that_is_none_is_refused(size, tmp_path):
     content = {"state_dict": {"w": torch.ones(1)}, "meta": {"image_size": size}}

@@ -177,6 +177,39 @@ def test_signals_of_the_pose_alone_are_those_of_maptr_on_argoverse_2(
     assert dataset.has_signals()
 
 
+def test_signals_are_zero_for_a_model_that_was_trained_without(
+    build, minicity_root, minicity_annotations, tmp_path
+):
+    source = AnnotationFile(minicity_annotations["train"])
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root)
+    for options in ({}, {"pose_only_signals": True}, {"signals_from_poses": True}):
+        dataset = build(**config, **options, zero_signals=True)
+        dataset.can_bus_in_memory = np.ones(18)
+        assert not dataset.get_data_info(0)["can_bus"].any()
+        assert not dataset.has_signals()
+    assert source.has_signals()
+    path = tmp_path / "gsmap_minicity_train.arrow"
+    write_annotations(path, source.meta, [replace(s, can_bus=None) for s in source])
+    assert not AnnotationFile(path).has_signals()
+
+
+def test_one_sample_with_signals_or_poses_that_give_them_count_as_signals(
+    build, minicity_root, minicity_annotations, tmp_path
+):
+    first, *others = AnnotationFile(minicity_annotations["train"])
+    meta = AnnotationFile(minicity_annotations["train"]).meta
+    path = tmp_path / "gsmap_minicity_train.arrow"
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root, ann_file=str(path))
+    write_annotations(path, meta, [replace(first, can_bus=None), *others])
+    assert build(**config).has_signals()
+    without = [replace(sample, can_bus=None) for sample in (first, *others)]
+    write_annotations(path, meta, without)
+    assert not build(**config).has_signals()
+    assert build(**config, signals_from_poses=True).has_signals()
+    write_annotations(path, replace(meta, options={**meta.options, "poses": False}), without)
+    assert not build(**config, signals_from_poses=True).has_signals()
+
+
 @pytest.fixture(scope="module")
 def with_heights(minicity_annotations, tmp_path_factory) -> Path:
     """MiniCity's training file with points of three coordinates: z = 0.1 x - 1.8."""

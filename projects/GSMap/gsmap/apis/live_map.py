@@ -33,6 +33,9 @@ _NO_SIGNALS_TEXT = (
     "can_bus. From poses, motion_signals of gsmap.structures.vehicle_signals makes it "
     "(pose_only_signals for configs that have it)."
 )
+_UNUSED_SIGNALS_TEXT = (
+    "the model was trained without vehicle signals: can_bus is not used, zeros are taken."
+)
 _NOTHING_NEAR_TEXT = (
     "the prior of {place!r} has nothing in the range of a frame. If the vehicle is in this place, "
     "compare the global frame of the prior with that of the poses."
@@ -242,6 +245,8 @@ class LiveMap:
         signals = None if can_bus is None else np.asarray(can_bus, dtype=float)
         if signals is None and self._expects_signals():
             self._warn_once(_NO_SIGNALS_TEXT)
+        if signals is not None and self._config.get("zero_signals"):
+            self._warn_once(_UNUSED_SIGNALS_TEXT)
         self._dataset.can_bus_in_memory = signals
         if at is not None:
             # Pose of the annotation frame of the model instead of the frame of the calibration.
@@ -272,6 +277,8 @@ class LiveMap:
     def _expects_signals(self) -> bool:
         """Whether the model reads vehicle signals and was trained with some."""
         if "can_bus" not in self._inferencer.model.bev_encoder.calibration:
+            return False
+        if self._config.get("zero_signals"):
             return False
         # `adopt_settings` sets the first key if the checkpoint records signals.
         keys = ("signals_from_poses", "pose_only_signals")

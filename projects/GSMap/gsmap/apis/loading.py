@@ -86,11 +86,7 @@ def load_model(
         model, trained=trained, wanted=cfg.test_dataloader.dataset.get("cameras")
     )
     model.mount = _training_mount(cfg, contents=contents, path=checkpoint)
-    # A checkpoint without settings is from an earlier version, which did not record whether the
-    # training data had vehicle signals.
-    model.without_signals = False
-    if contents is not None and contents.settings is not None:
-        model.without_signals = not contents.can_bus
+    model.without_signals = contents is not None and contents.without_signals
     model.training_dataset = _training_dataset(contents, name=checkpoint)
     model.rig = {} if contents is None else trained_rig(contents)
     if model.temporal is not None:

@@ -1,6 +1,7 @@
 """Predictor for exported models on a vehicle, which requires only numpy and onnxruntime."""
 
 import json
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from gsmap.structures.streams import Frame, MapStream, Scenes, StreamState
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
+_LOGGER = logging.getLogger(__name__)
 METADATA_KEY = "gsmap"  # key of the metadata, a JSON text, among the properties of the ONNX file
 FORMAT = 1  # version of the metadata; files of another version are refused
 # The next three texts are the values of the metadata's field ``can_bus``. They describe the vehicle
@@ -99,6 +101,7 @@ class OnnxInferencer:
         self.classes: tuple[str, ...] = tuple(self.metadata["classes"])
         self.cameras: tuple[str, ...] = tuple(self.metadata["cameras"])
         self.image_size: tuple[int, int] = tuple(self.metadata["image_size"])
+        self._noted_signals = False  # True after the note that given signals are not used
 
     def _read_graph(self) -> None:
         """Read and check the metadata, the inputs and the outputs of the graph."""
@@ -175,8 +178,8 @@ class OnnxInferencer:
                   original images in pixels, ``img_aug_matrix`` from the original to these images,
                   (V, 4, 4) each, and ``lidar2ego`` (4, 4) in metres, by default the transform of
                   the training data.
-                * GKT and BEVFormer also read ``can_bus`` (18,) of a record, unless the model was
-                  trained without vehicle signals.
+                * GKT and BEVFormer also read ``can_bus`` (18,) of a record. If the model was
+                  trained without vehicle signals, zeros are taken, even if it is given.
                 * Models with a map prior also read ``prior``, values in [0, 1] of the cells in the
                   range of the map. It has the shape ``prior_shape``; the default is zeros.
                 * Models with memory also read ``scene``, ``timestamp_ns`` and ``lidar2global``
@@ -224,6 +227,9 @@ class OnnxInferencer:
         """
         self._check_images(images)
         self._check_signals(meta)
+        if self.metadata.get("can_bus") == NO_SIGNALS and meta.get("can_bus") is not None:
+            self._note_unused_signals()
+            meta = {**meta, "can_bus": None}  # the input is then zero
         if meta.get("lidar2ego") is None:
             meta = {**meta, "lidar2ego": self.metadata.get("ego_from_frame")}
         # The arrays that the graph takes as inputs, computed from the matrices of `meta`.
@@ -279,6 +285,12 @@ class OnnxInferencer:
             f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
             "gsmap.structures.vehicle_signals; zeros for a model that was trained without signals."
         )
+
+    def _note_unused_signals(self) -> None:
+        """Log once that given vehicle signals are not used."""
+        if not self._noted_signals:
+            _LOGGER.warning("%s: can_bus is %s.", self.path.name, NO_SIGNALS)
+            self._noted_signals = True
 
     def _stream_inputs(self, meta: Mapping[str, Any], stream: Scenes | None) -> dict[str, Any]:
         """Inputs with the memory after the previous frame, and with the motion since then.

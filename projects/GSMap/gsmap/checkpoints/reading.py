@@ -61,6 +61,7 @@ class Checkpoint:
         image_size: Width and height of the training images after scaling, in pixels; None if
             unknown.
         can_bus: Whether the training samples had vehicle signals; False if unknown.
+        without_signals: Whether the training samples had no vehicle signals; False if unknown.
         trained_on: Name of the training's data set, and identity of its list of scenes; each is
             empty if unknown.
         dataset_meta: Metadata of the training's data set, not checked.
@@ -72,6 +73,7 @@ class Checkpoint:
     settings: Any
     image_size: tuple[int, int] | None
     can_bus: bool
+    without_signals: bool = False
     trained_on: tuple[str, str] = ("", "")
     dataset_meta: Mapping[str, Any] = field(default_factory=dict)
     calibration: dict[str, Any] = field(default_factory=dict)
@@ -212,6 +214,7 @@ def read_checked(path: str | Path) -> Checkpoint:
             settings=settings,
             image_size=_check_image_size(facts.get(IMAGE_SIZE)),
             can_bus=facts.get(SIGNALS) is True,
+            without_signals=meta.get(SIGNALS) is False,
             trained_on=(dataset, scene_list),
             dataset_meta=dataset_meta,
             calibration=calibration_of(meta),
@@ -282,8 +285,9 @@ def adopt_settings(
     Settings that only training uses (`TRAINING_SETTINGS`) and ``temporal.elements`` keep the values
     of the config. Test images are scaled to the size of the training images unless ``cfg_options``
     set the scale. If the training samples had vehicle signals, the signals of test samples without
-    them are computed from poses. Loading a checkpoint that lacks weights of the resulting model
-    raises an error, unless the config sets ``model.allow_untrained``.
+    them are computed from poses; if they had none, the signals of all test samples are zero.
+    Loading a checkpoint that lacks weights of the resulting model raises an error, unless the
+    config sets ``model.allow_untrained``.
 
     Args:
         cfg: The config; its ``model`` and ``test_dataloader`` are changed.
@@ -335,7 +339,8 @@ def adopt_settings(
 def _adopt_test_data(cfg: Config, checkpoint: Checkpoint, overrides: dict[str, Any]) -> None:
     """Set the image scale and the signals of the test data to the values of the training.
 
-    A scale that the user sets is kept, and so is ``signals_from_poses`` of the config.
+    A scale that the user sets is kept, and so are ``signals_from_poses`` and ``zero_signals`` of
+    the config.
 
     Args:
         cfg: The config; its ``test_dataloader`` is changed.
@@ -346,9 +351,11 @@ def _adopt_test_data(cfg: Config, checkpoint: Checkpoint, overrides: dict[str, A
     if checkpoint.image_size and not scale_is_set:
         for step in scale_steps(cfg, "test"):
             step.trained_size = checkpoint.image_size
-    if checkpoint.can_bus:
-        for dataset in innermost_datasets(cfg.test_dataloader.dataset):
+    for dataset in innermost_datasets(cfg.test_dataloader.dataset):
+        if checkpoint.can_bus:
             dataset.setdefault("signals_from_poses", True)
+        if checkpoint.without_signals:
+            dataset.setdefault("zero_signals", True)
 
 
 def _is_training_setting(name: str) -> bool:

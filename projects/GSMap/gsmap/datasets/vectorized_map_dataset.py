@@ -66,6 +66,8 @@ class VectorizedMapDataset(BaseDataset):
         pose_only_signals: Whether to replace the vehicle signals of all samples by signals that
             are computed from the pose alone, as in MapTR's code for Argoverse 2
             (`vehicle_signals.pose_only_signals`).
+        zero_signals: Whether the vehicle signals of all samples are zero, whatever other arguments
+            and the samples say. A test of a checkpoint that was trained without signals sets it.
         ground_z_m: Height of the road in the frame in metres, for a file that does not have it. For
             other files it must agree with the file.
         broken_samples: ``raise`` for an error at a sample with a missing or damaged file; ``skip``
@@ -99,6 +101,7 @@ class VectorizedMapDataset(BaseDataset):
         shuffle_images_seed: int | None = None,
         signals_from_poses: bool = False,
         pose_only_signals: bool = False,
+        zero_signals: bool = False,
         ground_z_m: float | None = None,
         broken_samples: str = "raise",
         max_refetch: int = 100,
@@ -145,6 +148,7 @@ class VectorizedMapDataset(BaseDataset):
         self._shuffle_images_seed = shuffle_images_seed
         self._signals_from_poses = signals_from_poses
         self._pose_only_signals = pose_only_signals
+        self._zero_signals = zero_signals
         self._ground_z_m = ground_z_m
         super().__init__(
             ann_file,
@@ -176,6 +180,12 @@ class VectorizedMapDataset(BaseDataset):
             print_log(
                 f"{self.ann_file} comes from an earlier version and has no checksum: damage may "
                 f"go unnoticed until you {self.annotations.remedy}",
+                logger="current",
+            )
+        if self._zero_signals and self.annotations.has_signals():
+            print_log(
+                f"{self.ann_file} has vehicle signals (can_bus), but the model was trained without "
+                "any: zeros are taken.",
                 logger="current",
             )
         for name in _METAINFO_OF_FILE:
@@ -440,6 +450,8 @@ class VectorizedMapDataset(BaseDataset):
 
         Signals that depend on an earlier frame are zero, too (`without_history`).
         """
+        if self._zero_signals:
+            return np.zeros(NUM_CAN_BUS)
         if self.can_bus_in_memory is not None:
             return without_history(self.can_bus_in_memory)
         if self._pose_only_signals:
@@ -484,11 +496,13 @@ class VectorizedMapDataset(BaseDataset):
         return sample.global_from_frame @ invert_rigid(ground)
 
     def has_signals(self) -> bool:
-        """Test whether samples have vehicle signals that need no poses of other samples.
-
-        The first sample stands for all samples.
-        """
-        return self._pose_only_signals or self.sample(0).can_bus is not None
+        """Test whether any sample has vehicle signals, from its record or computed from poses."""
+        if self._zero_signals:
+            return False
+        if self._pose_only_signals:
+            return True
+        from_poses = self._signals_from_poses and self.annotations.meta.has_poses
+        return from_poses or self.annotations.has_signals()
 
     def _images(self, sample: MapSample, entry: dict[str, int]) -> dict[str, dict[str, Any]]:
         """Return path, size and calibration of the images, by camera.

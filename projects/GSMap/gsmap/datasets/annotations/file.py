@@ -469,6 +469,10 @@ class AnnotationFile(Sequence[MapSample]):
                 rows.append(int(order[other_place]))
         return rows
 
+    def has_signals(self) -> bool:
+        """Test whether any sample has vehicle signals (``can_bus``)."""
+        return any(batch.column("can_bus").null_count < len(batch) for batch in self.batches)
+
     def instance_counts(self) -> np.ndarray:
         """Return the number of map elements of each sample, -1 without ground truth. (samples,)"""
         counts = [np.empty(0, dtype=np.int64)]  # the result for a file without batches
