@@ -16,6 +16,7 @@ import gsmap  # noqa: F401
 # isort: split
 import argparse
 import logging
+import math
 import tempfile
 from collections.abc import Iterator
 from functools import partial
@@ -32,16 +33,18 @@ from gsmap.apis.export import (
     largest_differences,
     quantize_onnx,
 )
-from gsmap.apis.map_inferencer import MapInferencer, select_samples
+from gsmap.apis.map_inferencer import MapInferencer, select_samples, spread_evenly
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.checkpoints.settings import single_dataset_of
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.engine.arguments import add_config_options
 from gsmap.utils.cli import CommandParser, output_file, run_command
-from gsmap.utils.errors import InputError
+from gsmap.utils.errors import InputError, WorkError
 
 if TYPE_CHECKING:  # slow to import
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+
+_RUN_LENGTH = 4  # smallest number of consecutive samples of a scene, for models with memory
 
 
 def parse_args() -> argparse.Namespace:
@@ -79,7 +82,11 @@ def parse_args() -> argparse.Namespace:
         "--samples", type=Path, help="samples to compare on; the config's test set by default"
     )
     parser.add_argument(
-        "--check", type=int, metavar="N", help="compare with torch on N samples, evenly spread"
+        "--check",
+        type=int,
+        metavar="N",
+        help="compare with torch on N samples, evenly spread; "
+        "for a model with memory, on consecutive samples of scenes",
     )
     parser.add_argument(
         "--results", type=output_file, help="JSON file for the predictions of ONNX Runtime"
@@ -174,10 +181,38 @@ def calibration_samples(
         Arrays of one sample, by the name of the input.
     """
     dataset = open_samples(inferencer, args, args.calibration, split="train")
-    tokens = dataset.annotations.column("token")
-    chosen = select_samples(tokens, max_num=args.calibration_samples)  # indices, evenly spread
+    chosen = choose_samples(inferencer, dataset, count=args.calibration_samples)
     for _, inputs in graph_inputs(exported, dataset, chosen):
         yield inputs
+
+
+def choose_samples(
+    inferencer: MapInferencer, dataset: "VectorizedMapDataset", count: int
+) -> list[int]:
+    """Choose samples that are evenly spread over a data set.
+
+    For a model with memory, they are the first samples of some scenes, at least `_RUN_LENGTH` of
+    each: the memory counts only in a sample that follows the one before.
+
+    Args:
+        inferencer: The model.
+        dataset: The data set.
+        count: Largest number of samples, at least 1.
+
+    Returns:
+        Indices of the samples, in the order of their times within a scene.
+
+    Raises:
+        ValueError: If ``count`` is smaller than 1.
+    """
+    if inferencer.model.temporal is None:
+        return select_samples(dataset.annotations.column("token"), max_num=count)
+    scenes = dataset.scenes()
+    length = max(_RUN_LENGTH, math.ceil(count / len(scenes)))  # samples of each chosen scene
+    chosen: list[int] = []
+    for number in spread_evenly(len(scenes), max_num=math.ceil(count / length)):
+        chosen += scenes[number][:length]
+    return chosen[:count]
 
 
 def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Namespace) -> str:
@@ -190,10 +225,12 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
 
     Returns:
         A sentence with the largest differences.
+
+    Raises:
+        RuntimeError: If the predictions of a file in single precision differ in all samples.
     """
     dataset = open_samples(inferencer, args, args.samples, split="test")
-    # Indices of samples, evenly spread over the data set.
-    chosen = select_samples(dataset.annotations.column("token"), max_num=args.check)
+    chosen = choose_samples(inferencer, dataset, count=args.check)
     # Indices of the classes whose points the model reorders to form a short path. The order is not
     # compared, since rounding decides between paths of nearly equal length.
     unfolded = exported.metadata.get("unfold_classes", [])
@@ -207,22 +244,45 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
     onnx_inputs = graph_inputs(exported, dataset, chosen)
     differences = []  # largest differences of each sample: of scores, and of points in metres
     predictions = []  # token and map elements of each sample, predicted by ONNX Runtime
+    num_continued = 0  # samples that the graph predicts with the memory of another one
     for sample, (token, inputs) in zip(torch_samples, onnx_inputs, strict=True):
         elements = exported.elements(exported.run(inputs))
         expected = elements_of_predictions(sample.pred_instances_3d)
         differences.append(largest_differences(elements, expected, unfolded))
         predictions.append((token, elements))
+        num_continued += int(exported.has_memory and inputs["continues"][0] > 0)
     if args.results:
         exported.write(args.results, predictions)
-    # Differences are infinite if the numbers of elements of a class differ.
+    text = describe_differences(differences, note=map_note)
+    if exported.has_memory:
+        text += f"; {num_continued} of the samples continue a stream"
+        if not num_continued:
+            text += ", so the memory was not compared: give --check a larger N, or other --samples"
+    num_equal = np.isfinite(differences).all(axis=1).sum()
+    if num_equal == 0 and not (args.fp16 or args.int8):
+        raise WorkError(f"{text}; if this is so with more samples, do not use {args.out}.")
+    return text
+
+
+def describe_differences(differences: list[tuple[float, float]], note: str = "") -> str:
+    """Describe how much predictions of ONNX Runtime and torch differ.
+
+    Args:
+        differences: Results of `largest_differences`, one for each sample. They are infinite if
+            the numbers of elements of a class differ.
+        note: Further condition of the predictions.
+    """
     finite_differences = [pair for pair in differences if np.isfinite(pair).all()]
-    # Without such a sample, the sentence reports 0.
-    score, distance_m = np.max(finite_differences or [(0, 0)], axis=0)
-    num_equal = len(finite_differences)
+    text = (
+        f"in {len(finite_differences)} of {len(differences)} samples, ONNX Runtime and torch "
+        f"predict{note} equal numbers of elements of each class"
+    )
+    if not finite_differences:
+        return text
+    score, distance_m = np.max(finite_differences, axis=0)
     return (
-        f"in {num_equal} of {len(chosen)} samples, ONNX Runtime and torch predict{map_note} equal "
-        "numbers of elements of each class; in these samples, scores differ by at most "
-        f"{score:.1e}, and nearest elements by at most {distance_m:.1e} m"
+        f"{text}; in these samples, scores differ by at most {score:.1e}, and nearest elements by "
+        f"at most {distance_m:.1e} m"
     )
 
 

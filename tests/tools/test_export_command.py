@@ -1,0 +1,86 @@
+"""Which samples tools/export.py compares on, and how it reports the differences."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tools import export as tool
+
+
+class Drives:
+    """Samples of drives of 20 frames, which lie frame by frame."""
+
+    def __init__(self, scenes: int):
+        self.num_scenes = scenes
+        tokens = [f"t{index}" for index in range(20 * scenes)]
+        self.annotations = SimpleNamespace(column=lambda _: tokens)
+
+    def scenes(self) -> list[list[int]]:
+        """Indices of each drive, in the order of their times."""
+        return [[s + self.num_scenes * i for i in range(20)] for s in range(self.num_scenes)]
+
+
+def model_with(temporal):
+    return SimpleNamespace(model=SimpleNamespace(temporal=temporal, prior=None))
+
+
+@pytest.mark.parametrize(
+    ("count", "lengths"), [(1, [1]), (5, [4, 1]), (8, [4, 4]), (24, [8, 8, 8]), (99, [20, 20, 20])]
+)
+def test_a_model_with_memory_is_compared_on_samples_in_a_row(count, lengths):
+    chosen = tool.choose_samples(model_with(object()), Drives(3), count)
+    runs = {}
+    for index in chosen:
+        runs.setdefault(index % 3, []).append(index // 3)
+    assert list(runs.values()) == [list(range(length)) for length in lengths]
+
+
+def test_other_models_are_compared_on_samples_far_apart():
+    assert tool.choose_samples(model_with(None), Drives(3), 3) == [0, 30, 59]
+    for temporal in (None, object()):
+        with pytest.raises(ValueError, match="must be >= 1, got"):
+            tool.choose_samples(model_with(temporal), Drives(3), -1)
+
+
+def report_of(differences, monkeypatch, continues=None, fp16=False) -> str:
+    """Report of a comparison with these differences of scores and metres, one for each sample."""
+    samples = [SimpleNamespace(pred_instances_3d=None) for _ in differences]
+    inputs = [("t", {"continues": np.array([c])}) for c in continues or [0.0] * len(differences)]
+    remaining = iter(differences)
+    monkeypatch.setattr(tool, "open_samples", lambda *_, **__: Drives(1))
+    monkeypatch.setattr(tool, "graph_inputs", lambda *_: inputs)
+    monkeypatch.setattr(tool, "largest_differences", lambda *_: next(remaining))
+    monkeypatch.setattr(tool, "elements_of_predictions", lambda _: None)
+    inferencer = model_with(None)
+    inferencer.predict = lambda *_: samples
+    exported = SimpleNamespace(
+        metadata={}, has_memory=continues is not None, run=lambda _: {}, elements=lambda _: None
+    )
+    args = SimpleNamespace(
+        samples=None, check=len(samples), results=None, fp16=fp16, int8=False, out="m.onnx"
+    )
+    return tool.check(inferencer, exported, args)
+
+
+def test_the_largest_differences_of_equal_samples_are_reported(monkeypatch):
+    text = report_of([(1e-6, 2e-5), (np.inf, np.inf), (3e-6, 1e-5)], monkeypatch)
+    assert text.startswith("in 2 of 3 samples, ONNX Runtime and torch predict equal numbers")
+    assert text.endswith("differ by at most 3.0e-06, and nearest elements by at most 2.0e-05 m")
+
+
+def test_samples_that_all_differ_are_an_error_in_single_precision(monkeypatch):
+    differences = [(np.inf, np.inf)] * 2
+    with pytest.raises(RuntimeError, match=r"in 0 of 2 .* each class; if .* do not use m.onnx"):
+        report_of(differences, monkeypatch)
+    text = report_of(differences, monkeypatch, fp16=True)
+    assert text.startswith("in 0 of 2 samples")
+    assert text.endswith("equal numbers of elements of each class")
+
+
+def test_a_comparison_says_whether_the_memory_counted(monkeypatch):
+    pairs = [(0.0, 0.0)] * 3
+    text = report_of(pairs, monkeypatch, continues=[0.0, 1.0, 1.0])
+    assert text.endswith("m; 2 of the samples continue a stream")
+    text = report_of(pairs, monkeypatch, continues=[0.0, 0.0, 0.0])
+    assert "0 of the samples continue a stream, so the memory was not compared: give" in text
