@@ -16,13 +16,13 @@ from mmengine.logging import print_log
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
+from gsmap.checkpoints.class_axes import ClassAxis
 from gsmap.checkpoints.convert import ours_from_upstream, summarize_names
 from gsmap.checkpoints.key_map import is_upstream
 from gsmap.checkpoints.named_models import named_models
 from gsmap.checkpoints.settings import plain
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.engine.run_log import innermost
-from gsmap.models.base.layers import ClassAxis
 from gsmap.structures.frames import FRAME_VIEWS, viewing_azimuth
 from gsmap.utils.errors import InputError
 from gsmap.utils.shipped import shipped_path

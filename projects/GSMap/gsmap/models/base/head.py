@@ -12,12 +12,13 @@ from mmengine.model import bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
+from gsmap.checkpoints.class_axes import mark_classes
 from gsmap.models.base.class_losses import ClassLoss
 from gsmap.models.base.coder import MapCoder, Samples, Tensors
 from gsmap.models.base.decoder import Decoded, MapDecoder, Queries
 from gsmap.models.base.groups import QueryGroup
 from gsmap.models.base.hooks import FlowHook, FlowPart, FlowStart
-from gsmap.models.base.layers import classification_branch, init_matrices, mark_classes
+from gsmap.models.base.layers import classification_branch, init_matrices
 from gsmap.models.base.loss_head import LossHead
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.masks import ElementMasks

@@ -14,7 +14,7 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import mark_classes
+from gsmap.checkpoints.class_axes import mark_classes
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape, constant
 from gsmap.utils.errors import InputError

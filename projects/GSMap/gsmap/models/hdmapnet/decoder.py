@@ -5,7 +5,8 @@ from typing import Any, NamedTuple, cast
 from mmdet.models.backbones.resnet import BasicBlock
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import mark_classes, resize_map, resnet_stages
+from gsmap.checkpoints.class_axes import mark_classes
+from gsmap.models.base.layers import resize_map, resnet_stages
 from gsmap.models.hdmapnet.encoder import JoinedMaps, conv_block
 
 

@@ -12,8 +12,8 @@ from mmengine.dist import get_world_size
 from mmengine.logging import print_log
 from torch import Tensor
 
+from gsmap.checkpoints.class_axes import mark_classes
 from gsmap.checkpoints.strict import AddsWeights
-from gsmap.models.base.layers import mark_classes
 from gsmap.models.base.parts import DEFAULTS, build_part
 from gsmap.models.encoders.camera_encoder import stack_calibration
 from gsmap.models.hrmapnet.bev_fusion import PriorBEVFusion

@@ -9,9 +9,9 @@ from typing import Any
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.checkpoints.class_axes import mark_classes
 from gsmap.models.base.coder import Detections, MapCoder
 from gsmap.models.base.head import MapHead
-from gsmap.models.base.layers import mark_classes
 from gsmap.models.base.parts import PartConfig
 from gsmap.models.streammapnet.decoder import StreamMapNetDecoder
 from gsmap.models.streammapnet.reference import LineReference

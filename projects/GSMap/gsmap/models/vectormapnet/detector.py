@@ -13,14 +13,10 @@ from mmengine.model import bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
+from gsmap.checkpoints.class_axes import mark_classes
 from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
-from gsmap.models.base.layers import (
-    classification_branch,
-    feed_forward,
-    init_matrices,
-    mark_classes,
-)
+from gsmap.models.base.layers import classification_branch, feed_forward, init_matrices
 from gsmap.models.base.matching import solve_assignment
 from gsmap.models.base.parts import PartConfig
 from gsmap.models.base.references import Reference

@@ -11,7 +11,8 @@ import torch
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import init_matrices, mark_classes
+from gsmap.checkpoints.class_axes import mark_classes
+from gsmap.models.base.layers import init_matrices
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import BEVEmbedding
 from gsmap.models.vectormapnet.layers import Cache, GatedLayer, append_cache, keep_most_likely
