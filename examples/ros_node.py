@@ -155,7 +155,7 @@ def markers(elements: MapElements, stamp: Any) -> Iterator[Any]:
         marker.header.frame_id = VEHICLE
         marker.header.stamp = stamp
         marker.points = [Point(x=x, y=y, z=0.0) for x, y in line[:, :2].tolist()]
-        marker.color.r, marker.color.g, marker.color.b = COLOURS[label]
+        marker.color.r, marker.color.g, marker.color.b = COLOURS[label % len(COLOURS)]
         marker.color.a = 1.0
         marker.scale.x = 0.1  # width of the line in metres
         marker.pose.orientation.w = 1.0  # no rotation

@@ -206,3 +206,5 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
     assert {line.header.frame_id for line in lines} == {"base_footprint"}
     assert all(len(line.points) == 20 and line.header.stamp.sec == 8 for line in lines)
     assert max(abs(point.x) for line in lines for point in line.points) > 20  # ahead is x
+    many = scope["MapElements"].from_polylines(np.zeros((5, 2, 2)), labels=np.arange(5))
+    assert len(list(scope["markers"](many, None))) == 5  # of more classes than colours
