@@ -21,7 +21,7 @@ import tempfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,10 @@ from gsmap.utils.errors import InputError, WorkError
 if TYPE_CHECKING:  # slow to import
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
+# Steps of a pipeline that do not change images.
+_OTHER_STEPS = (
+    "LoadCameraImages", "LoadLidarPoints", "LoadLidarSweeps", "PointsToFrame", "PackMapInputs",
+)  # fmt: skip
 _RUN_LENGTH = 4  # smallest number of consecutive samples of a scene, for models with memory
 
 
@@ -286,6 +290,29 @@ def describe_differences(differences: list[tuple[float, float]], note: str = "")
     )
 
 
+def image_notes(pipeline: list[dict[str, Any]]) -> list[str]:
+    """Sentences on steps of a pipeline that change images in another way than bilinear scaling.
+
+    Such steps precede the exported file, so a vehicle must do them as well.
+
+    Args:
+        pipeline: Transforms of the test data, as in a config.
+    """
+    notes: list[str] = []
+    for step in pipeline:
+        kind = str(step["type"]).rpartition(".")[-1]
+        options = ", ".join(f"{name}={value}" for name, value in step.items() if name != "type")
+        is_usual = step.get("kernel", "bilinear") == "bilinear"
+        if kind in _OTHER_STEPS or (kind == "ScaleImages" and is_usual):
+            continue
+        notes.append(
+            f"the images of the training were also changed by {kind}({options}), which is not in "
+            "the file: change the images of the vehicle in this way before the file gets them, and "
+            "lidar2img alike."
+        )
+    return notes
+
+
 def main() -> str:
     args = parse_args()
     for name in ("torch.onnx", "onnxscript"):  # their notes are about optional steps
@@ -299,6 +326,8 @@ def main() -> str:
         f"{args.out}: {len(exported.cameras)} cameras of {rows} x {columns}, "
         f"{args.out.stat().st_size / 2**20:.1f} MiB"
     )
+    for note in image_notes(inferencer.cfg.test_dataloader.dataset.pipeline):
+        print(f"note: {note}")
     return check(inferencer, exported, args) if args.check else "not compared: give --check N"
 
 

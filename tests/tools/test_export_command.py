@@ -43,6 +43,17 @@ def test_other_models_are_compared_on_samples_far_apart():
             tool.choose_samples(model_with(temporal), Drives(3), -1)
 
 
+def test_steps_of_images_that_a_file_does_not_have_are_noted():
+    load, pack = {"type": "LoadCameraImages"}, {"type": "PackMapInputs"}
+    for scale in ({"scale": 0.5}, {"size": (8, 6)}, {"size": (8, 6), "kernel": "bilinear"}):
+        assert tool.image_notes([load, {"type": "ScaleImages", **scale}, pack]) == []
+    scale = {"type": "ScaleImages", "size": (896, 512), "kernel": "bicubic"}
+    crop = {"type": "mmdet3d.CropImages", "top": 128}
+    first, second = tool.image_notes([load, scale, crop, pack])
+    assert "also changed by ScaleImages(size=(896, 512), kernel=bicubic), which is not" in first
+    assert "also changed by CropImages(top=128), which is not in the file: chan" in second
+
+
 def report_of(differences, monkeypatch, continues=None, fp16=False) -> str:
     """Report of a comparison with these differences of scores and metres, one for each sample."""
     samples = [SimpleNamespace(pred_instances_3d=None) for _ in differences]
