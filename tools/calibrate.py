@@ -128,7 +128,7 @@ def main() -> str:
         # Factors along and across the line. (classes, 2)
         factors = fit_factors(vertices, classes, args.sigmas, args.law)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
-    meta = {  # read when the checkpoint is loaded or tested
+    meta: dict[str, Any] = {  # read when the checkpoint is loaded or tested
         MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())),
         CALIBRATION: {"law": args.law, "sigmas": args.sigmas},
     }
