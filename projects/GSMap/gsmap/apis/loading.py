@@ -52,12 +52,12 @@ def load_model(
         * ``cfg``: Its config, with the settings of its training.
         * ``mount``: Pose of its annotation frame on the vehicle of the training data (`Mount`).
         * ``rig``: Cameras of the training data by name: width, height, fx, fy, cx, cy in pixels.
-        * ``camera_names``: Names of the cameras in the order of the encoder's embeddings of
-          cameras. If the cameras of the test data are cameras of the training, the model has the
-          embeddings of these, in their order; otherwise it has those of the training. None if the
-          encoder has no such embeddings, or their cameras are unknown.
+        * ``camera_names``: Cameras of the encoder's embeddings, in order; None if unknown.
         * ``training_dataset``: Name of the training's data set; empty if unknown.
         * ``without_signals``: Whether the training data is known to lack vehicle signals (CAN bus).
+
+        If the cameras of the test data are cameras of the training, the model has the embeddings
+        of these, in their order; otherwise it has those of the training.
 
     Raises:
         FileNotFoundError: If the config or the checkpoint does not exist.
