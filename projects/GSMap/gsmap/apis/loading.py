@@ -10,7 +10,6 @@ import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
 
-from gsmap.apis.trained_cameras import choose_cameras, trained_cameras
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.named_models import find_checkpoint, named_models
 from gsmap.checkpoints.reading import Checkpoint, adopt_settings, load_weights, read_checked
@@ -64,6 +63,8 @@ def load_model(
         ValueError: If the config or the checkpoint cannot be read, if the checkpoint belongs to
             another architecture, or if its settings or its mount are not valid.
     """
+    from gsmap.apis.trained_cameras import choose_cameras, trained_cameras  # slow to import
+
     cfg = read_config(config, cfg_options)
     if checkpoint is None and str(config) in named_models():
         checkpoint = str(config)

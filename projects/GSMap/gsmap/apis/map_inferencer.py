@@ -29,7 +29,6 @@ from gsmap.apis.input_dataset import open_dataset
 from gsmap.apis.live_map import LiveMap
 from gsmap.apis.loading import load_model
 from gsmap.apis.map_priors import maps_for
-from gsmap.apis.rig_fit import camera_names, camera_rows
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.settings import single_dataset_of
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -289,6 +288,8 @@ class MapInferencer:
         trained = self.model.camera_names
         if trained is None:
             return dataset, None
+        from gsmap.apis.rig_fit import camera_names, camera_rows  # slow to import
+
         if dataset.cameras is None:  # each sample would have its cameras in an order of its own
             dataset = copy.copy(dataset)
             dataset.cameras = tuple(camera_names(dataset))
