@@ -226,7 +226,7 @@ def test_masks_that_are_not_as_many_as_the_classes_stay_as_they_are():
 
 
 def test_a_layer_at_several_places_is_reordered_at_each():
-    """StreamMapNet's decoder layers share a branch, as here."""
+    """Decoder layers may share a branch, as here."""
     names = ["boundary", "divider", "ped_crossing"]
     trained, model = build_small(0), build_small(1, classes=names)
     for built in (trained, model):

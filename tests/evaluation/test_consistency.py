@@ -256,10 +256,11 @@ def test_predictions_that_are_no_lines_do_not_count(points, has_tracks, files, t
             if has_tracks:
                 own["track_id"] = number
     (tmp_path / "short.json").write_text(json.dumps(content))
-    assert evaluate_drives(tmp_path / "short.json", annotations, CONFIG) == figures
-    for frame in drive_frames(tmp_path / "short.json", annotations, CONFIG.classes):
+    tracked = tmp_path / "tracked.json"
+    assert evaluate_drives(tmp_path / "short.json", annotations, CONFIG, tracked) == figures
+    for frame in drive_frames(tracked, annotations, CONFIG.classes):
         assert len(frame.predictions) == 1
-        assert not has_tracks or frame.track_ids.tolist() == [1]
+        assert frame.track_ids.tolist() == [int(has_tracks)]
 
 
 def test_the_command_scores_drives_and_writes_tracks(files, tmp_path, capsys):

@@ -95,16 +95,16 @@ def test_table_gives_last_and_best(run):
 
 def test_only_a_mean_ap_has_a_best_value(tmp_path):
     """A smaller error is better. Names of metrics and classes may contain "map"."""
-    names = ("bemapnet/divider/error_m@1.5", "pld/PLD", "raster/heatmap/AP")
+    names = ("newmap/divider/error_m@1.5", "pld/PLD", "raster/heatmap/AP")
     records = []
     for step, value in ((1, 0.9), (2, 0.5)):
-        records.append({"step": step, "bemapnet/mAP": value} | dict.fromkeys(names, value))
+        records.append({"step": step, "newmap/mAP": value} | dict.fromkeys(names, value))
     write_log(tmp_path / "a", "20260101_000000", records)
     log = read_run(tmp_path / "a")
-    assert log.metrics == ["bemapnet/mAP"]
+    assert log.metrics == ["newmap/mAP"]
     assert summary_table([log]).splitlines()[2].split("|")[-2].strip() == "0.5 / 0.9"
     for record in records:
-        del record["bemapnet/mAP"]
+        del record["newmap/mAP"]
     write_log(tmp_path / "b", "20260101_000000", records)
     log = read_run(tmp_path / "b")
     assert log.metrics == list(names)

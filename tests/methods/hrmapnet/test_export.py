@@ -78,6 +78,6 @@ def test_a_check_compares_with_an_empty_map_for_all_samples(monkeypatch):
     monkeypatch.setattr(export, "open_samples", lambda *_, **__: samples)
     monkeypatch.setattr(export, "graph_inputs", lambda *_: [])
     options = SimpleNamespace(samples=None, check=2, results=None)
-    text = export.check(inferencer, SimpleNamespace(metadata={}), options)
+    text = export.check(inferencer, SimpleNamespace(metadata={}, has_memory=False), options)
     assert "predict, with an empty map of earlier drives, equal numbers" in text
     assert not maps[0].writes

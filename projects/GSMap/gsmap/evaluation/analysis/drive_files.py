@@ -73,9 +73,8 @@ def _read_frames(
         ids = _convert_tracks(values, results=results, token=token)
         if ids is not None:
             _check_tracks(ids, elements=elements, results=results, token=token)
-        is_line = elements.num_points >= 2  # other metrics leave out fewer points, too
-        predictions[token] = elements.select(is_line)
-        track_ids[token] = None if ids is None else ids[is_line]
+        predictions[token] = elements
+        track_ids[token] = ids
         if len(elements):  # an empty sample does not show whether the file has tracks
             last_token[ids is not None] = token
     if len(last_token) > 1:
@@ -111,6 +110,13 @@ def _read_frames(
         )
         frames.append(frame)
     return frames
+
+
+def _with_lines_only(frame: DriveFrame) -> DriveFrame:
+    """Leave out predictions of fewer than two points, as other metrics do."""
+    is_line = frame.predictions.num_points >= 2
+    ids = None if frame.track_ids is None else frame.track_ids[is_line]
+    return replace(frame, predictions=frame.predictions.select(is_line), track_ids=ids)
 
 
 def _convert_tracks(values: list[object], results: Path, token: str) -> IntArray | None:
@@ -193,7 +199,8 @@ def evaluate_drives(
             (`drive_frames`), or if the annotations have no poses or no ground truth.
     """
     samples = SampleFile(results, key=RESULTS_KEY, classes=config.classes, gaussians=True)
-    frames = _read_frames(samples, annotations, classes=config.classes)
+    read_frames = _read_frames(samples, annotations, classes=config.classes)
+    frames = [_with_lines_only(frame) for frame in read_frames]
     figures = consistency(frames, config)
     if tracks_file is not None:
         write_tracks(tracks_file, frames=frames, config=config, about=samples.about)
