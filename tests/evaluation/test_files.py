@@ -408,6 +408,24 @@ def test_ground_truth_outside_of_the_canvas_is_noted(tmp_path, capsys):
         assert "ground truth reaches" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("priors", "said"),
+    [
+        ([{"also_predicted": 0}, {"also_predicted": 7}, {"also_predicted": 2}], "leak: 7 samples"),
+        ([{"also_predicted": 0}], ""),
+        ([{"also_predicted": True}, {"also_predicted": "9"}, {}, 3, None], ""),  # not by us
+        ({"also_predicted": 7}, ""),
+    ],
+)
+def test_results_with_a_prior_of_their_samples_are_noted(priors, said, tmp_path, capsys):
+    truth = annotated(tmp_path / "val.arrow", 8)
+    write_results(tmp_path / "results.json", results_of(8), {"priors": priors})
+    command()([str(tmp_path / "results.json"), str(truth), "--eval", "chamfer"])
+    printed = capsys.readouterr().out
+    assert ("leak:" in printed) == bool(said)
+    assert said in printed
+
+
 def test_a_description_behind_the_ground_truth_is_refused(tmp_path):
     """Where the keys are sorted, ``GTs`` comes before ``meta``."""
     results, _, export = write_ego_truth(tmp_path)

@@ -25,6 +25,7 @@ from gsmap.evaluation.core.results_json import (
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
+from gsmap.utils.model_facts import PRIORS
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard
@@ -347,7 +348,7 @@ class SamplePairs:
         return Sample(token, predictions, truth)
 
     def notes(self, counts_heights: bool, canvas: BEVGrid | None = None) -> list[Note]:
-        """Return notes on ignored elements, heights, range and samples, after iterating.
+        """Return notes on ignored elements, heights, range, samples and priors, after iterating.
 
         Args:
             counts_heights: Whether heights (z) count in a metric; if not, a note says so.
@@ -356,7 +357,7 @@ class SamplePairs:
         Returns:
             Notes for `joined_notes`.
         """
-        notes = [(0, note) for note in self._mismatches]
+        notes = [(0, note) for note in (*self._mismatches, *self._prior_notes())]
         ignored_predictions = Counter(self._results.ignored)
         ignored_truth = Counter(self._truth.ignored)
         num_with_heights = ignored_predictions.pop(THREE_D, 0) + ignored_truth.pop(THREE_D, 0)
@@ -379,6 +380,21 @@ class SamplePairs:
         for name, number in sorted(ignored_truth.items()):
             notes.append((number, f"ground truths of class {name!r} are not scored"))
         return notes
+
+    def _prior_notes(self) -> list[str]:
+        """Return a note if the predictions were made with a prior of their own samples."""
+        priors = self.about.get(PRIORS)
+        largest_count = 0
+        for prior in priors if isinstance(priors, list) else []:
+            count = prior.get("also_predicted") if isinstance(prior, dict) else None
+            if type(count) is int:
+                largest_count = max(largest_count, count)
+        if not largest_count:
+            return []
+        return [
+            f"leak: {format_count(largest_count, 'sample')} had gone into the map of earlier "
+            "drives that the model read (--prior), so these figures are too good"
+        ]
 
     def _canvas_notes(self, canvas: BEVGrid) -> list[str]:
         """Return a note if the ground truth leaves a canvas."""
