@@ -48,6 +48,7 @@ if TYPE_CHECKING:  # slow to import
 _OTHER_STEPS = (
     "LoadCameraImages", "LoadLidarPoints", "LoadLidarSweeps", "PointsToFrame", "PackMapInputs",
 )  # fmt: skip
+_FEW_SAMPLES = 3  # rounding may change which elements of one sample or two have enough score
 _RUN_LENGTH = 4  # smallest number of consecutive samples of a scene, for models with memory
 
 
@@ -212,11 +213,18 @@ def choose_samples(
     if inferencer.model.temporal is None:
         return select_samples(dataset.annotations.column("token"), max_num=count)
     scenes = dataset.scenes()
+    if count < 1 or not scenes:
+        return select_samples(dataset.annotations.column("token"), max_num=count)  # its error
     length = max(_RUN_LENGTH, math.ceil(count / len(scenes)))  # samples of each chosen scene
+    evenly = list(spread_evenly(len(scenes), max_num=math.ceil(count / length)))
+    others = [number for number in range(len(scenes)) if number not in evenly]
+    sizes = [len(scene) for scene in scenes]
+    while sum(min(size, length) for size in sizes) < min(count, sum(sizes)):
+        length *= 2  # other scenes are short
     chosen: list[int] = []
-    for number in spread_evenly(len(scenes), max_num=math.ceil(count / length)):
-        chosen += scenes[number][:length]
-    return chosen[:count]
+    for number in (*evenly, *others):  # further scenes if the first ones are short
+        chosen += scenes[number][: min(length, count - len(chosen))]
+    return chosen
 
 
 def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Namespace) -> str:
@@ -263,8 +271,8 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
         if not num_continued:
             text += ", so the memory was not compared: give --check a larger N, or other --samples"
     differs = [not np.isfinite(pair).all() for pair in differences]
-    if differs and all(differs) and not (args.fp16 or args.int8):
-        raise WorkError(f"{text}; if this is so with more samples, do not use {args.out}.")
+    if all(differs) and len(differs) >= _FEW_SAMPLES and not (args.fp16 or args.int8):
+        raise WorkError(f"{text}: do not use {args.out}.")
     return text
 
 
@@ -300,7 +308,7 @@ def image_notes(pipeline: list[dict[str, Any]]) -> list[str]:
     """
     notes: list[str] = []
     for step in pipeline:
-        kind = str(step["type"]).rpartition(".")[-1]
+        kind = getattr(step["type"], "__name__", str(step["type"])).rpartition(".")[-1]
         options = ", ".join(f"{name}={value}" for name, value in step.items() if name != "type")
         is_usual = step.get("kernel", "bilinear") == "bilinear"
         if kind in _OTHER_STEPS or (kind == "ScaleImages" and is_usual):

@@ -349,7 +349,11 @@ def run_settings(args: argparse.Namespace, cfg: "Config") -> dict[str, str]:
     from gsmap.checkpoints.settings import plain  # slow to import
 
     checkpoint = chosen_checkpoint(args)
-    used = plain([cfg.model, cfg.test_dataloader.dataset.pipeline])
+    # Paths differ between machines, and the samples have a digest of their own.
+    dataset = dict(cfg.test_dataloader.dataset)
+    for name in ("ann_file", "data_root", "data_prefix"):
+        dataset.pop(name, None)
+    used = plain([cfg.model, dataset])
     settings = {
         "model": args.model[0],
         "config": hashlib.sha256(json.dumps(used, sort_keys=True).encode()).hexdigest(),

@@ -132,11 +132,14 @@ def describe_priors(runner: Any, priors: list[Any], paths: list[Path]) -> None:
         paths: Their files.
     """
     from gsmap.apis.map_priors import facts_of_priors, leak_warnings
+    from gsmap.engine.run_log import innermost
     from gsmap.utils.model_facts import PRIORS
 
     loop = runner.test_loop
-    annotations = getattr(loop.dataloader.dataset, "annotations", None)
-    tokens = [] if annotations is None else annotations.column("token")  # a data set of the user
+    tokens = []
+    for dataset in innermost(loop.dataloader.dataset):
+        if hasattr(dataset, "tokens"):  # not a data set class of a user
+            tokens += dataset.tokens()
     facts = facts_of_priors(priors, paths, tokens)
     for line in leak_warnings(facts, len(tokens)):
         runner.logger.warning(line)
@@ -149,6 +152,7 @@ def main() -> None:
         raise InputError("Nothing to do: name a metric after --eval, or a file after --out.")
     from mmengine.model import is_model_wrapper
 
+    from gsmap.apis.loading import zero_signals_note
     from gsmap.apis.map_priors import empty_reads, use_priors
     from gsmap.apis.trained_cameras import TrainedCamerasHook
     from gsmap.checkpoints.building import building
@@ -173,10 +177,12 @@ def main() -> None:
     with building(cfg), ExitStack() as stack:
         runner = MapRunner.from_cfg(cfg)
         runner.register_hook(TrainedCamerasHook(args.config, checkpoint, contents))
+        # In a distributed test, the model is within a wrapper.
+        model = runner.model.module if is_model_wrapper(runner.model) else runner.model
+        if note := zero_signals_note(model, cfg):
+            runner.logger.warning(note)
         priors = []
         if args.prior:
-            # In a distributed test, the model is within a wrapper.
-            model = runner.model.module if is_model_wrapper(runner.model) else runner.model
             priors = use_priors(model, args.prior, stack)
             describe_priors(runner, priors, args.prior)
         metrics = runner.test()

@@ -90,6 +90,31 @@ def test_names_that_do_not_fit_the_embeddings_are_not_used(weights, tmp_path):
     assert load_model(cfg, weights / "bare.pth").camera_names is None
 
 
+def test_without_names_the_order_is_that_of_the_training_data(weights):
+    usual = load_model(make_config(), weights / "bare.pth").bev_encoder.cams_embeds
+    cfg = make_config()
+    cfg.train_dataloader = {"dataset": {"cameras": list(NAMES)}}
+    cfg.test_dataloader.dataset.cameras = list(NAMES[::-1])
+    model = load_model(cfg, weights / "bare.pth")
+    assert list(model.camera_names) == list(NAMES[::-1])
+    assert torch.equal(model.bev_encoder.cams_embeds, usual.flip(0))
+
+
+def test_a_test_of_a_users_data_set_keeps_the_embeddings(weights):
+    model = load_model(make_config(), weights / "named.pth")
+    runner = SimpleNamespace(
+        model=model, cfg=make_config(), test_dataloader=SimpleNamespace(dataset=[])
+    )
+    path = weights / "named.pth"
+    hook = TrainedCamerasHook(make_config(), path, read_checked(path))
+    embeds = model.bev_encoder.cams_embeds
+    hook.before_test(runner)
+    hook.before_test_iter(runner, 0)
+    assert model.bev_encoder.cams_embeds is embeds
+    hook.after_test_iter(runner, 0)
+    assert model.bev_encoder.cams_embeds is embeds
+
+
 def test_a_test_selects_the_embeddings_during_each_iteration(weights, tmp_path):
     path = weights / "named.pth"
     samples = make_samples(tmp_path, 1)

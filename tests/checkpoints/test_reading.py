@@ -9,6 +9,8 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from torch import nn
 
+from gsmap.apis.rig_fit import training_facts
+from gsmap.checkpoints.named_models import named_models
 from gsmap.checkpoints.published import load_from_file
 from gsmap.checkpoints.reading import (
     adopt_settings,
@@ -147,12 +149,34 @@ def test_test_data_are_as_those_that_the_checkpoint_was_trained_on(small, tmp_pa
     assert small.test_dataloader.dataset.signals_from_poses is True  # the named model's were given
 
 
+def test_a_shipped_checkpoint_is_known_by_any_path(monkeypatch, tmp_path):
+    file = named_models()["maptr_r18_minicity"].file
+    (tmp_path / "link.pth").symlink_to(file)
+    monkeypatch.chdir(file.parent)
+    for path in (file, file.name, f"../{file.parent.name}/{file.name}", tmp_path / "link.pth"):
+        checkpoint = read_checked(path)
+        assert (checkpoint.image_size, checkpoint.can_bus) == ((160, 90), True)
+        facts = training_facts(path, dataset_meta=None)
+        assert facts["cameras"][0] == "CAM_FRONT"
+    assert training_facts(tmp_path / "other.pth", dataset_meta=None) == {}
+
+
 def test_test_data_have_no_signals_if_the_training_had_none(tmp_path):
-    for meta, wanted in (({"can_bus": False}, True), ({"can_bus": True}, None), ({}, None)):
+    without = {"can_bus": False}
+    for meta, wanted in ((without, True), ({"can_bus": True}, None), ({}, None)):
         path = save(tmp_path / "a.pth", {"state_dict": {"w": torch.ones(1)}, "meta": meta})
         cfg = read_config("configs/maptr/maptr_r18_minicity.py")
         adopt_settings(cfg, path, None)
         assert cfg.test_dataloader.dataset.get("zero_signals") is wanted
+    for name in ("signals_from_poses", "pose_only_signals"):  # the config asks for signals
+        path = save(tmp_path / "a.pth", {"state_dict": {"w": torch.ones(1)}, "meta": without})
+        cfg = read_config("configs/maptr/maptr_r18_minicity.py")
+        cfg.test_dataloader.dataset[name] = True
+        adopt_settings(cfg, path, None)
+        assert "zero_signals" not in cfg.test_dataloader.dataset
+    cfg.test_dataloader.dataset = {"type": "mmengine.BaseDataset"}  # has no such argument
+    adopt_settings(cfg, path, None)
+    assert cfg.test_dataloader.dataset == {"type": "mmengine.BaseDataset"}
     cfg.test_dataloader.dataset.zero_signals = False  # asked for by hand
     adopt_settings(cfg, save(tmp_path / "a.pth", {"state_dict": {"w": torch.ones(1)}}), None)
     assert cfg.test_dataloader.dataset.zero_signals is False

@@ -71,6 +71,19 @@ def test_milestones_that_a_training_does_not_reach_are_refused(scheduler, epochs
         ([{"type": "PolyLR", "begin": 20}], "begins after 20"),
         ([{"type": "LinearLR", "end": 24}], None),
         ([{"milestones": [8], "end": 8}], "comes after 8"),
+        ([{"type": "mmengine.LinearLR", "end": 24}], None),
+        ([{"type": "LinearMomentum", "end": 24}], None),
+        ([{"milestones": [8], "end": 1_000_000_000}], None),  # mmengine's default
+        ([{"milestones": [8], "end": float("inf")}], None),
+        ([{"type": "OneCycleLR", "total_steps": 20}], None),
+        (
+            [{"type": "OneCycleLR", "total_steps": 24}],
+            r"set both .* and param_scheduler\.0\.total_steps",
+        ),
+        ([{"type": "CosineRestartLR", "periods": [8, 12]}], None),
+        ([{"type": "CosineRestartLR", "periods": [12, 12]}], r"schedule 24: .*\.0\.periods"),
+        ([{"milestones": [8], "end": None}], "must be numbers of epochs, got 0 and None"),
+        ([{"milestones": [8], "begin": "2"}], "must be numbers of epochs, got '2' and 20"),
     ],
 )
 def test_schedules_may_have_an_end_of_their_own(schedulers, reason):
@@ -114,4 +127,6 @@ def test_a_training_by_iterations_needs_schedules_by_iterations():
     with pytest.raises(ValueError, match=r"never change a value: set param_scheduler\.0\.by_epoch"):
         check_schedules(cfg)
     cfg.param_scheduler[0].convert_to_iter_based = True
+    check_schedules(cfg)
+    cfg.param_scheduler = [{"type": "ReduceOnPlateauLR"}]  # changes values after a validation
     check_schedules(cfg)

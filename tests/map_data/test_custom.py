@@ -463,6 +463,10 @@ def test_global_coordinates_that_were_rounded_to_float32_are_counted(tmp_path: P
         assert "10 of 10 records have positions in global_from_frame that are rounded" in text
         assert "global_instances" not in text
     assert "float32" not in warnings_of([rounded(records[0], np.asarray), *records[1:]])
+    origin = np.eye(4)
+    origin[:3, 3] = 690_000, 5_334_000, 0  # of single frames
+    single = [{**item, "global_from_frame": origin, "global_instances": []} for item in records]
+    assert "float32" not in warnings_of(single)
     coarse = []
     for item in records:
         line = {"label": 0, "points": np.float32(item["global_instances"][0]["points"])}

@@ -65,6 +65,11 @@ def test_ground_truth_has_full_confidence_and_a_sample_may_be_empty():
     assert (len(empty), empty.points.shape, empty.polylines) == (0, (0, 2), [])
 
 
+@pytest.mark.parametrize("labels", [[], (), np.array([], object), np.array([], str), np.empty(0)])
+def test_no_labels_of_any_type_are_no_elements(labels):
+    assert len(MapElements.from_polylines([], labels)) == 0
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -101,7 +106,8 @@ def test_bad_elements_are_refused(values, message):
 
 
 def test_whole_labels_of_any_type_are_accepted():
-    for labels in ([0.0, 2.0], np.float32([0, 2]), np.uint8([0, 2]), [[0], [2]]):
+    column = np.array([0, 2], object)
+    for labels in ([0.0, 2.0], np.float32([0, 2]), np.uint8([0, 2]), [[0], [2]], column):
         elements = MapElements.from_polylines([LINE, RING], labels)
         assert elements.labels.dtype == np.int64
         assert elements.labels.tolist() == [0, 2]

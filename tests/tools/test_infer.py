@@ -175,7 +175,8 @@ def test_a_run_whose_config_has_changed_begins_anew(drive, model, tmp_path, monk
     # Shards with one config and with the other do not belong together.
     parts = ["--out", str(tmp_path / "parts.json"), "--shard"]
     infer.main([*words[:-2], *parts, "0/2"])
-    base.write_text(f"_base_ = {str(Path(model[0]).resolve())!r}\n")
+    with base.open("a") as file:  # a setting of the data
+        file.write("test_dataloader = dict(dataset=dict(pose_only_signals=True))\n")
     infer.main([*words[:-2], *parts, "1/2"])
     with pytest.raises(ValueError, match="differs in config"):
         merge([str(tmp_path / "parts.json")])

@@ -28,7 +28,7 @@ from gsmap.checkpoints.settings import differences, plain, single_dataset_of
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, read_config
-from gsmap.engine.schedules import check_schedules, find_milestones, find_schedulers
+from gsmap.engine.schedules import NEVER, check_schedules, find_milestones, find_schedulers
 from gsmap.engine.targets import class_of_type
 from gsmap.evaluation.core.evaluator import METRIC_NAMES
 from gsmap.evaluation.map_metric import MapMetric
@@ -415,8 +415,9 @@ def _epoch_options(name: str, scheduler: Mapping[str, Any], old_end: int, end: i
         ValueError: If the schedule has more milestones than there are epochs for them.
     """
     options: list[str] = []
-    if "end" in scheduler:
-        if scheduler["end"] < old_end:
+    own_end = scheduler.get("end", NEVER)
+    if isinstance(own_end, int | float) and own_end < NEVER:  # `check_config` refuses other types
+        if own_end < old_end:
             return []
         options.append(f"{name}.end={end}")
     begin = scheduler.get("begin", 0)

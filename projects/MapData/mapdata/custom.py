@@ -194,6 +194,7 @@ def create_samples(
     has_warned = False
     tokens_of: dict[str, list[str]] = {}  # tokens of the records that a warning is about
     places: set[tuple[str, str]] = set()  # scene and map_name of the records
+    coarse_positions: set[tuple[float, ...]] = set()  # x and y of poses that a warning is about
     count = 0
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
@@ -207,6 +208,8 @@ def create_samples(
             count += 1
             for warning in _coarse_coordinates(record):
                 tokens_of.setdefault(warning, []).append(sample.token)
+                position = np.asarray(record[_POSE], np.float64)[:2, 3]
+                coarse_positions.add(tuple(position.tolist()))
             places.add((sample.scene, sample.map_name))
             if sample.instances is not None:
                 whole = join_lines(sample.instances, meta.classes) if join else sample.instances
@@ -219,8 +222,8 @@ def create_samples(
             height_m = -road_z_m
             _LOGGER.warning(_UNMOUNTED, sample.token, height_m)
         yield sample
-    # A few positions are float32 numbers by chance.
-    if 2 * len(tokens_of.get(_COARSE_POSES, [])) <= count:
+    # A few positions are float32 numbers by chance, and an origin of single frames may be round.
+    if 2 * len(tokens_of.get(_COARSE_POSES, [])) <= count or len(coarse_positions) == 1:
         tokens_of.pop(_COARSE_POSES, None)
     for warning, tokens in tokens_of.items():
         _LOGGER.warning(warning, len(tokens), count, tokens[0])

@@ -1,6 +1,7 @@
 """``build_map --elements`` and ``--prior`` of ``infer`` and ``test``, on a tiny MiniCity."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -8,8 +9,10 @@ from mmdet3d.registry import MODELS
 
 from gsmap.engine.launch import read_config
 from gsmap.prior import ElementPrior
+from gsmap.prior.sources import PriorSources
 from gsmap.structures.elements import MapElements
 from tools import build_map, infer
+from tools.test import describe_priors
 
 FUSION = ["--cfg-options", "model.prior.type=ElementFusion"]
 
@@ -96,3 +99,27 @@ def test_priors_and_options_that_do_not_fit_are_refused(
     errors = capsys.readouterr().err
     assert "a prior has --gaussians or --elements" in errors
     assert "--elements is for a --prior" in errors
+
+
+def test_a_test_counts_the_tested_samples_that_a_prior_was_made_of(tmp_path):
+    """Data sets may be joined, and may have a part of the samples of their files."""
+    path = tmp_path / "town.prior"
+    path.write_bytes(b"prior")
+    sources = PriorSources()
+    for token in ("a", "b", "c", "d"):
+        sources.add(token)
+    prior = SimpleNamespace(settings=SimpleNamespace(place="town"), sources=sources)
+    joined = SimpleNamespace(
+        datasets=[SimpleNamespace(tokens=lambda: ["x", "a"]), SimpleNamespace(tokens=lambda: ["b"])]
+    )
+    for dataset, count, number in ((joined, 2, 3), (SimpleNamespace(), 0, 0)):
+        warnings = []
+        evaluator = SimpleNamespace(dataset_meta={"classes": ("divider",)})
+        loop = SimpleNamespace(dataloader=SimpleNamespace(dataset=dataset), evaluator=evaluator)
+        logger = SimpleNamespace(warning=warnings.append)
+        describe_priors(SimpleNamespace(test_loop=loop, logger=logger), [prior], [path])
+        (facts,) = evaluator.dataset_meta["priors"]
+        assert (facts["made_of"], facts["also_predicted"]) == (4, count)
+        assert evaluator.dataset_meta["classes"] == ("divider",)
+        assert len(warnings) == bool(count)
+        assert not count or f"leak: {count} of {number} samples are among the 4" in warnings[0]

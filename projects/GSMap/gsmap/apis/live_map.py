@@ -245,7 +245,8 @@ class LiveMap:
         signals = None if can_bus is None else np.asarray(can_bus, dtype=float)
         if signals is None and self._expects_signals():
             self._warn_once(_NO_SIGNALS_TEXT)
-        if signals is not None and self._config.get("zero_signals"):
+        reads_signals = "can_bus" in self._inferencer.model.bev_encoder.calibration
+        if signals is not None and reads_signals and self._config.get("zero_signals"):
             self._warn_once(_UNUSED_SIGNALS_TEXT)
         self._dataset.can_bus_in_memory = signals
         if at is not None:

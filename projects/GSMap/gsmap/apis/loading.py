@@ -13,6 +13,7 @@ from mmengine.config import Config
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.named_models import find_checkpoint, named_models
 from gsmap.checkpoints.reading import Checkpoint, adopt_settings, load_weights, read_checked
+from gsmap.checkpoints.settings import innermost_datasets
 from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.source import Mount
 from gsmap.engine.launch import read_config
@@ -82,6 +83,8 @@ def load_model(
     if checkpoint is not None:
         load_weights(model, path=checkpoint, checkpoint=contents)
     model.cfg = cfg
+    if note := zero_signals_note(model, cfg):
+        _LOGGER.warning(note)
     trained = trained_cameras(model, config=config, cfg=cfg, path=file, checkpoint=contents)
     model.camera_names = choose_cameras(
         model, trained=trained, wanted=cfg.test_dataloader.dataset.get("cameras")
@@ -137,6 +140,23 @@ def _training_dataset(contents: Checkpoint | None, name: object) -> str:
     is_shipped = model is not None and not model.address  # others have a download address
     default = "minicity" if is_shipped else ""
     return str(contents.dataset_meta.get("dataset", default))
+
+
+def zero_signals_note(model: Any, cfg: Config) -> str:
+    """Say that the vehicle signals of the test data are zero; empty if the model reads none.
+
+    Args:
+        model: The built model.
+        cfg: Its config, with the settings of its training.
+    """
+    reads_signals = "can_bus" in getattr(model.bev_encoder, "calibration", ())
+    datasets = innermost_datasets(cfg.test_dataloader.dataset)
+    if not reads_signals or not any(dataset.get("zero_signals") for dataset in datasets):
+        return ""
+    return (
+        "the model was trained without vehicle signals (can_bus), so those of all samples are "
+        "zero; test_dataloader.dataset.zero_signals=False uses them."
+    )
 
 
 def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> Mount:

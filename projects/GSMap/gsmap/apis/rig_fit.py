@@ -4,7 +4,6 @@ The cameras of a vehicle together are called a rig.
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from torch.nn.functional import interpolate
 from gsmap.checkpoints.class_axes import ClassAxis
 from gsmap.checkpoints.convert import ours_from_upstream, summarize_names
 from gsmap.checkpoints.key_map import is_upstream
-from gsmap.checkpoints.named_models import named_models
+from gsmap.checkpoints.named_models import model_of_file
 from gsmap.checkpoints.settings import plain
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.engine.run_log import innermost
@@ -401,11 +400,11 @@ def training_facts(path: Any, dataset_meta: Any) -> dict[str, Any]:
         The known facts among ``cameras``, ``classes``, ``frame``, ``x_range`` and ``y_range``.
     """
     metadata: Any = dataset_meta or {}
-    for model in named_models().values():
-        if not metadata and Path(str(path)) == model.file:
-            config = Config.fromfile(shipped_path(model.config))
-            metadata = dict(config.train_dataloader.dataset)
-            metadata |= metadata["grid"]  # x_range and y_range
+    model = None if metadata else model_of_file(str(path))
+    if model is not None:
+        config = Config.fromfile(shipped_path(model.config))
+        metadata = dict(config.train_dataloader.dataset)
+        metadata |= metadata["grid"]  # x_range and y_range
     if not isinstance(metadata, Mapping):
         return {}
     item_types = {"cameras": str, "classes": str, "frame": str, "x_range": float, "y_range": float}

@@ -15,6 +15,7 @@ from torch import nn
 
 from gsmap.apis.rig_fit import camera_rows, training_facts
 from gsmap.checkpoints.reading import Checkpoint
+from gsmap.checkpoints.settings import innermost_datasets
 from gsmap.engine.launch import read_config
 from gsmap.engine.run_log import innermost
 from gsmap.utils.errors import InputError
@@ -33,8 +34,8 @@ def trained_cameras(
     """Find the names of the cameras that a model was trained on.
 
     They are read from the checkpoint. If it does not name them, they are the cameras of the config
-    of a named model, or else of the test data in ``config``. The overrides of a command are the
-    last source, because they may select cameras of the model.
+    of a named model, or else of the training data, or the test data, in ``config``. The overrides
+    of a command are the last source, because they may select cameras of the model.
 
     Args:
         model: The model.
@@ -63,9 +64,13 @@ def trained_cameras(
 
 
 def _cameras_of_config(cfg: Config) -> Sequence[str] | None:
-    """Names of the cameras of the test data of a config; None if it does not name them."""
-    dataset = (cfg.get("test_dataloader") or {}).get("dataset") or {}
-    return dataset.get("cameras")
+    """Names of the cameras of the training data of a config, or else of its test data."""
+    for part in ("train", "test"):
+        dataset = (cfg.get(f"{part}_dataloader") or {}).get("dataset") or {}
+        for inner_dataset in innermost_datasets(dataset):
+            if inner_dataset.get("cameras"):
+                return inner_dataset["cameras"]
+    return None
 
 
 def choose_cameras(
@@ -149,7 +154,14 @@ class TrainedCamerasHook(Hook):
         )
         if trained is None:
             return
-        datasets = innermost(runner.test_dataloader.dataset)
+        # A data set class of a user may not name its cameras.
+        datasets = [
+            dataset
+            for dataset in innermost(runner.test_dataloader.dataset)
+            if hasattr(dataset, "cameras")
+        ]
+        if not datasets:
+            return
         assignments = [camera_rows(dataset, trained=trained) for dataset in datasets]
         if any(rows != assignments[0] for rows in assignments):
             raise InputError(

@@ -61,6 +61,15 @@ def named_models() -> dict[str, NamedModel]:
     return models
 
 
+def model_of_file(path: str | Path) -> NamedModel | None:
+    """Model whose weights a file contains; None if it is the file of no named model."""
+    resolved = Path(path).resolve()
+    for model in named_models().values():
+        if model.file.resolve() == resolved:
+            return model
+    return None
+
+
 def list_models() -> list[str]:
     """Names of the models whose weights are available: shipped models and fetched ones."""
     return [name for name, model in named_models().items() if model.file.is_file()]

@@ -1,5 +1,6 @@
 """Reading of checkpoints, and loading of their weights. Every error message contains a remedy."""
 
+import inspect
 import json
 import pickle
 import re
@@ -12,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from mmdet3d.registry import MODELS
+from mmdet3d.registry import DATASETS, MODELS
 from mmengine.config import Config, ConfigDict
 from mmengine.logging import print_log
 from torch import Tensor, nn
 
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.convert import summarize_names
-from gsmap.checkpoints.named_models import find_checkpoint, named_models
+from gsmap.checkpoints.named_models import find_checkpoint, model_of_file
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import (
     IMAGE_SIZE,
@@ -230,10 +231,8 @@ def read_checked(path: str | Path) -> Checkpoint:
 
 def _facts_of_named_model(path: Path) -> dict[str, Any]:
     """Return the fields of a file's entry in `named_models`; empty without an entry."""
-    for model in named_models().values():
-        if model.file == path:
-            return vars(model)
-    return {}
+    model = model_of_file(path)
+    return {} if model is None else vars(model)
 
 
 def _check_image_size(size: Any) -> tuple[int, int] | None:
@@ -339,8 +338,8 @@ def adopt_settings(
 def _adopt_test_data(cfg: Config, checkpoint: Checkpoint, overrides: dict[str, Any]) -> None:
     """Set the image scale and the signals of the test data to the values of the training.
 
-    A scale that the user sets is kept, and so are ``signals_from_poses`` and ``zero_signals`` of
-    the config.
+    A scale that the user sets is kept, and so are settings of signals in the config. A data set
+    class of a user may lack these settings.
 
     Args:
         cfg: The config; its ``test_dataloader`` is changed.
@@ -352,10 +351,23 @@ def _adopt_test_data(cfg: Config, checkpoint: Checkpoint, overrides: dict[str, A
         for step in scale_steps(cfg, "test"):
             step.trained_size = checkpoint.image_size
     for dataset in innermost_datasets(cfg.test_dataloader.dataset):
-        if checkpoint.can_bus:
+        if checkpoint.can_bus and _accepts(dataset, "signals_from_poses"):
             dataset.setdefault("signals_from_poses", True)
-        if checkpoint.without_signals:
+        asks_for_signals = dataset.get("signals_from_poses") or dataset.get("pose_only_signals")
+        is_unset = checkpoint.without_signals and not asks_for_signals
+        if is_unset and _accepts(dataset, "zero_signals"):
             dataset.setdefault("zero_signals", True)
+
+
+def _accepts(dataset: dict[str, Any], name: str) -> bool:
+    """Whether the class of a data set in a config has an argument of this name."""
+    kind = dataset.get("type")
+    dataset_class = DATASETS.get(kind) if isinstance(kind, str) else kind
+    if dataset_class is None:
+        return False  # an error follows when it is built
+    parameters = inspect.signature(dataset_class).parameters
+    takes_any = any(value.kind is value.VAR_KEYWORD for value in parameters.values())
+    return name in parameters or takes_any
 
 
 def _is_training_setting(name: str) -> bool:

@@ -182,12 +182,6 @@ class VectorizedMapDataset(BaseDataset):
                 f"go unnoticed until you {self.annotations.remedy}",
                 logger="current",
             )
-        if self._zero_signals and self.annotations.has_signals():
-            print_log(
-                f"{self.ann_file} has vehicle signals (can_bus), but the model was trained without "
-                "any: zeros are taken.",
-                logger="current",
-            )
         for name in _METAINFO_OF_FILE:
             self._metainfo[name] = getattr(self.annotations.meta, name)
         self._metainfo["ground_z_m"] = self._ground_height()

@@ -7,16 +7,18 @@ from mmengine.config import Config, ConfigDict
 
 from gsmap.utils.errors import InputError
 
-_WARM_UPS = ("ConstantLR", "LinearLR")  # schedules that may end after a short training
+_WARM_UPS = ("Constant", "Linear")  # names of schedules that may end after a short training
+NEVER = 1_000_000_000
+"""End that mmengine takes for a schedule without an end."""
 
 
 def check_schedules(cfg: Config, iterations: int | None = None) -> None:
     """Require that the schedules of a config fit the length of its training.
 
     A schedule starts after ``begin`` epochs or iterations, and counts from there. A cosine schedule
-    must last ``T_max`` until its own end or that of the training, and ``milestones`` must lie
-    before. A schedule other than a warm-up must not end after the training. If the training counts
-    iterations, schedules must, too.
+    (``T_max``, ``total_steps`` or ``periods``) must last until its own end or that of the training,
+    and ``milestones`` must lie before. A schedule other than a warm-up must not end after the
+    training. If the training counts iterations, schedules must, too.
 
     Args:
         cfg: Config of a training.
@@ -36,6 +38,8 @@ def check_schedules(cfg: Config, iterations: int | None = None) -> None:
                 _check_length(cfg, name=name, training=iterations, unit="iterations")
         elif epochs is not None:
             _check_length(cfg, name=name, training=epochs, unit="epochs")
+        elif _kind(scheduler).startswith("ReduceOnPlateau"):
+            continue  # it changes values after a validation
         elif counts_iterations and not scheduler.get("convert_to_iter_based"):
             raise InputError(
                 f"{cfg.filename}: training counts iterations, but {name} counts epochs and would "
@@ -54,22 +58,14 @@ def _check_length(cfg: Config, name: str, training: int, unit: str) -> None:
     """
     scheduler = find_schedulers(cfg)[name]
     setting = "train_cfg.max_epochs" if unit == "epochs" else "the length of the training"
-    begin = scheduler.get("begin", 0)
-    own_end = scheduler.get("end", training)
-    if begin >= training or (own_end > training and scheduler.get("type") not in _WARM_UPS):
-        raise InputError(
-            f"{cfg.filename}: training lasts {training} {unit} but {name} begins after {begin} and "
-            f"ends after {own_end}: set {name}.begin and .end to numbers up to {training}, or a "
-            f"larger number for {setting}."
-        )
-    end = min(own_end, training)
-    length = scheduler.get("T_max")
+    begin, end = _range_of(cfg, name=name, training=training, unit=unit)
+    key, length = _own_length(scheduler)
     if length is not None and length != end - begin:
         start = f" and begins after {begin}" if begin else ""
         own = f" and ends after {end}" if end < training else ""
         raise InputError(
             f"{cfg.filename}: training lasts {training} {unit} but the cosine schedule {length}"
-            f"{start}{own}: set both {setting} and {name}.T_max, or inherit from a base file that "
+            f"{start}{own}: set both {setting} and {name}.{key}, or inherit from a base file that "
             "sets both."
         )
     last = max(find_milestones(scheduler), default=0)
@@ -79,6 +75,54 @@ def _check_length(cfg: Config, name: str, training: int, unit: str) -> None:
             f"schedule comes after {begin + last}: set {name}.milestones to numbers below "
             f"{end - begin}, or a larger number for {setting}."
         )
+
+
+def _range_of(cfg: Config, name: str, training: int, unit: str) -> tuple[float, float]:
+    """Begin and end of a schedule, within the training.
+
+    Args:
+        cfg: Config of a training.
+        name: Dotted name of the schedule.
+        training: Length of the training.
+        unit: Unit of all lengths.
+
+    Raises:
+        ValueError: If the schedule never begins, or ends after the training and is no warm-up.
+    """
+    scheduler = find_schedulers(cfg)[name]
+    begin = scheduler.get("begin", 0)
+    end = scheduler.get("end", training)
+    if not isinstance(begin, int | float) or not isinstance(end, int | float):
+        raise InputError(
+            f"{cfg.filename}: {name}.begin and .end must be numbers of {unit}, got {begin!r:.40} "
+            f"and {end!r:.40}."
+        )
+    if end >= NEVER:
+        end = training
+    if begin >= training or (end > training and not _kind(scheduler).startswith(_WARM_UPS)):
+        raise InputError(
+            f"{cfg.filename}: training lasts {training} {unit} but {name} begins after {begin} and "
+            f"ends after {end}: set {name}.begin and .end to numbers up to {training}, or a larger "
+            "number for the length of the training."
+        )
+    return begin, min(end, training)
+
+
+def _own_length(scheduler: Mapping[str, Any]) -> tuple[str, float | None]:
+    """Setting with the length of a cosine schedule of any kind, and its value; None without one."""
+    for key in ("T_max", "total_steps"):
+        if isinstance(scheduler.get(key), int | float):
+            return key, scheduler[key]
+    periods = scheduler.get("periods")
+    if isinstance(periods, list | tuple) and all(isinstance(x, int | float) for x in periods):
+        return "periods", sum(periods)
+    return "", None
+
+
+def _kind(scheduler: Mapping[str, Any]) -> str:
+    """Name of the class of a scheduler, without the scope of a registry; empty if unknown."""
+    kind = scheduler.get("type", "")
+    return str(getattr(kind, "__name__", kind)).rpartition(".")[-1]
 
 
 def find_milestones(scheduler: Mapping[str, Any]) -> list[float]:

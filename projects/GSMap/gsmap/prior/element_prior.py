@@ -71,7 +71,7 @@ class ElementPrior:
     Attributes:
         content: Word for the stored data in messages.
         reads: Samples at which a model has read this prior.
-        sources: Samples that this prior was made of. Whoever makes it adds their tokens.
+        sources: Samples that this prior was made of, added by the code that makes it.
 
     Raises:
         ValueError: If a label, a score or a vertex is out of range, an element has no length or

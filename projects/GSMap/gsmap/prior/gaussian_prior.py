@@ -89,7 +89,7 @@ class GaussianPrior:
     Attributes:
         content: Name of the stored objects, for messages.
         reads: Samples at which a model has read this prior.
-        sources: Samples that this prior was made of. Whoever makes it adds their tokens.
+        sources: Samples that this prior was made of, added by the code that makes it.
     """
 
     content: ClassVar[str] = "Gaussians"

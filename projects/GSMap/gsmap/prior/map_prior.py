@@ -57,7 +57,7 @@ class MapPrior:
 
     Attributes:
         reads: Samples at which a model has read this prior.
-        sources: Samples that this prior was made of. Whoever writes them adds their tokens.
+        sources: Samples that this prior was made of, added by the code that writes them.
     """
 
     def __init__(

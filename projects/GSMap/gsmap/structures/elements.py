@@ -235,6 +235,10 @@ class MapElements:
 def _whole_labels(labels: npt.ArrayLike) -> IntArray:
     """Convert labels to integers, and refuse values that an integer would change. (N,)"""
     values = np.asarray(labels).reshape(-1)
+    if values.dtype.kind == "O":  # such as a column of a table
+        values = np.array(values.tolist())
+    if not len(values):
+        return np.empty(0, dtype=np.int64)
     # The kinds are truth values, signed and unsigned integers, and floating-point numbers.
     if values.dtype.kind not in "biuf":
         raise InputError(f"labels must be class indices, got {values[0]!r:.80}.")
