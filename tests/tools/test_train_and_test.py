@@ -301,6 +301,7 @@ def test_a_checkpoint_of_other_classes_than_the_data_set_is_not_tested(tmp_path,
 def test_figures_of_a_users_metric_are_written(tmp_path, monkeypatch):
     figures = {"a": np.float32(0.5), "b": torch.tensor(3), "c": np.arange(2), "d": tmp_path}
     runner = SimpleNamespace(rank=0, test=lambda: figures, register_hook=lambda hook: None)
+    runner.model = SimpleNamespace(bev_encoder=None)
     monkeypatch.setattr(MapRunner, "from_cfg", lambda _: runner)
     out = tmp_path / "metrics.json"
     monkeypatch.setattr(sys, "argv", ["test.py", "gsmap_r18_minicity", "--metrics-out", str(out)])
