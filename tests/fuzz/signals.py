@@ -125,8 +125,12 @@ def case(name: str, end: str, data: "Data", limit_s: float) -> str:  # noqa: F82
     wrong = [f"left: {', '.join(left.values())}"] * bool(left)
     wrong += [f"exit code {code}, not {expected}"] * (code != expected)
     wrong += [f"half-written: {partial}"] * (bool(partial) and end != "kill -9")
-    # Python's thread that hands a worker's tensors over may speak when its partner is gone
-    others = [text for text in said.split("Traceback")[1:] if "resource_sharer.py" not in text]
+    # Python's thread that hands a worker's tensors over may speak when its partner is gone. The
+    # worker may be killed before it has named a file.
+    others = []
+    for text in said.split("Traceback")[1:]:
+        if "resource_sharer.py" not in text and 'File "' in text:
+            others.append(text)
     wrong += ["a traceback"] * bool(others)
     return "; ".join(wrong) + f": {said[-4000:]}" * bool(wrong)
 
