@@ -154,15 +154,12 @@ class TrainedCamerasHook(Hook):
         )
         if trained is None:
             return
-        # A data set class of a user may not name its cameras.
-        datasets = [
-            dataset
-            for dataset in innermost(runner.test_dataloader.dataset)
-            if hasattr(dataset, "cameras")
-        ]
-        if not datasets:
+        assignments = []  # for each data set, the trained cameras of its cameras
+        for dataset in innermost(runner.test_dataloader.dataset):
+            if hasattr(dataset, "cameras"):  # a data set class of a user may not name its cameras
+                assignments.append(camera_rows(dataset, trained=trained))
+        if not assignments:
             return
-        assignments = [camera_rows(dataset, trained=trained) for dataset in datasets]
         if any(rows != assignments[0] for rows in assignments):
             raise InputError(
                 "the test data sets have other cameras or other orders of cameras: give all of "

@@ -35,9 +35,9 @@ def check_schedules(cfg: Config, iterations: int | None = None) -> None:
     for name, scheduler in find_schedulers(cfg).items():
         if not scheduler.get("by_epoch", True):
             if iterations is not None:
-                _check_length(cfg, name=name, training=iterations, unit="iterations")
+                _check_length(cfg, name, scheduler, training=iterations, unit="iterations")
         elif epochs is not None:
-            _check_length(cfg, name=name, training=epochs, unit="epochs")
+            _check_length(cfg, name, scheduler, training=epochs, unit="epochs")
         elif _kind(scheduler).startswith("ReduceOnPlateau"):
             continue  # it changes values after a validation
         elif counts_iterations and not scheduler.get("convert_to_iter_based"):
@@ -47,18 +47,20 @@ def check_schedules(cfg: Config, iterations: int | None = None) -> None:
             )
 
 
-def _check_length(cfg: Config, name: str, training: int, unit: str) -> None:
+def _check_length(
+    cfg: Config, name: str, scheduler: Mapping[str, Any], training: int, unit: str
+) -> None:
     """Require that one schedule fits the length of the training.
 
     Args:
         cfg: Config of a training.
         name: Dotted name of the schedule.
+        scheduler: Its settings.
         training: Length of the training.
         unit: Unit of all lengths, ``"epochs"`` or ``"iterations"``.
     """
-    scheduler = find_schedulers(cfg)[name]
     setting = "train_cfg.max_epochs" if unit == "epochs" else "the length of the training"
-    begin, end = _range_of(cfg, name=name, training=training, unit=unit)
+    begin, end = _range_of(cfg, name, scheduler, training=training, unit=unit)
     key, length = _own_length(scheduler)
     if length is not None and length != end - begin:
         start = f" and begins after {begin}" if begin else ""
@@ -77,19 +79,21 @@ def _check_length(cfg: Config, name: str, training: int, unit: str) -> None:
         )
 
 
-def _range_of(cfg: Config, name: str, training: int, unit: str) -> tuple[float, float]:
+def _range_of(
+    cfg: Config, name: str, scheduler: Mapping[str, Any], training: int, unit: str
+) -> tuple[float, float]:
     """Begin and end of a schedule, within the training.
 
     Args:
         cfg: Config of a training.
         name: Dotted name of the schedule.
+        scheduler: Its settings.
         training: Length of the training.
         unit: Unit of all lengths.
 
     Raises:
         ValueError: If the schedule never begins, or ends after the training and is no warm-up.
     """
-    scheduler = find_schedulers(cfg)[name]
     begin = scheduler.get("begin", 0)
     end = scheduler.get("end", training)
     if not isinstance(begin, int | float) or not isinstance(end, int | float):

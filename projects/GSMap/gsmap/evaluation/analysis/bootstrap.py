@@ -247,6 +247,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     """
     if not report.detections:
         return {}
+    # Intervals and groups are of the AP that is computed here, so it must be the metric's own.
     for key, (value,) in _figures(report, _Whole()).items():
         own_value = report.figure(key)
         if abs(value - own_value) > _SAME_AP:
